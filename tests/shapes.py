@@ -1,6 +1,7 @@
-"""What checks shapes in the tests: beartype, for annotations that name a shape and for nothing else.
+"""Shape checks of the tests: beartype, for annotations that name the shape of an array and for nothing else.
 
-Values of a wrong kind stay the package's own business: it refuses them with lines that tests read.
+Values of a wrong kind are refused by the package, with lines that tests read. So `Float[ArrayLike, "n"]`, an input that
+becomes an array, is not checked here: its shape is for the reader.
 """
 
 from collections.abc import Callable
@@ -19,5 +20,5 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _has_shape(hint: Any) -> bool:
     if isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray):
-        return True
+        return hint.array_type is not Any
     return any(_has_shape(part) for part in get_args(hint))

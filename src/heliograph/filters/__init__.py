@@ -1,4 +1,4 @@
-"""What turns measurements into estimates: `base` says what a filter is, every other file holds one idea."""
+"""Filters turn measurements into estimates: `base` defines what a filter is, every other file holds one idea."""
 
 import lazy_loader
 

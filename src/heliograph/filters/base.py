@@ -1,4 +1,4 @@
-"""What every filter is: deterministic predictions and corrections of an explicit state, of known sizes and claim."""
+"""Interface of every filter: deterministic predictions and corrections of an explicit state, with sizes and a claim."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -35,11 +35,14 @@ class AbstractFilter(Module):
 
     Deterministic: it never receives a random key. A component of z that is NaN did not arrive and is skipped. The
     state is a pytree of arrays, so one filter object serves a stream, a recording and thousands of runs at once.
+    To write one: give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and
+    `estimate` under `@in_float64` where they compute anything. Data of other sizes than these fields state are refused.
 
-    It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
-    what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
-    give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and `estimate` under
-    `@in_float64` where they compute anything.
+    Args:
+        claim: what the covariance is: "exact", "upper", "nominal" or "none".
+        states: names of the states that are estimated, n of them.
+        inputs: names of the inputs that `predict` takes.
+        received: length of the measurement z; 0 for a filter that uses none, and then z may have any length.
     """
 
     claim: eqx.AbstractVar[Claim]
@@ -48,23 +51,32 @@ class AbstractFilter(Module):
     received: eqx.AbstractVar[int]
 
     def init(self) -> PyTree:
-        """State before the first step."""
+        """Return the state of the filter before the first step."""
         raise NotImplementedError
 
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Over step k with the input u of shape (inputs,): from what is known of x before it to x after it."""
+        """Predict over step k with the input u (inputs,): from the state before the step to the prior after it."""
         raise NotImplementedError
 
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Use the measurement z of shape (received,) of step k; where nothing arrived, the state stays as it is."""
+        """Correct with the measurement z (received,) of step k; where nothing arrived, the state stays as it is."""
         raise NotImplementedError
 
     def estimate(self, state: PyTree) -> Estimate:
-        """What is known in this state: after `predict` the prediction, after `correct` the estimate."""
+        """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`."""
         raise NotImplementedError
 
     def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
-        """Predict over step k with the input u, then use the measurement z.
+        """Predict over step k with the input u, then correct with the measurement z.
+
+        Args:
+            state: the filter's state after step k - 1.
+            z: measurement (received,); NaN for a component that did not arrive.
+            u: input (inputs,) over the step.
+            k: number of the step, from 0.
+
+        Returns:
+            The state and the estimate after the step.
 
         Raises:
             ValueError: z, u or k of another size than the filter's; infinite values; an input that is NaN.
@@ -75,7 +87,9 @@ class AbstractFilter(Module):
     def step_judged(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
     ) -> tuple[PyTree, Estimate, Judgement]:
-        """As `step`, with what is to be said of z and u; a state with which something is implausible is not to be kept.
+        """Step like `step`, and judge whether z and u are plausible.
+
+        A state with which something is implausible should be discarded.
 
         Raises:
             ValueError: what `step` refuses.
@@ -86,7 +100,7 @@ class AbstractFilter(Module):
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
     ) -> tuple[PyTree, AbstractSmootherStep]:
-        """As `step`, with what a sweep back over it needs in place of the estimate.
+        """Step like `step`, and return the smoother step in place of the estimate.
 
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
@@ -97,10 +111,19 @@ class AbstractFilter(Module):
     def smoother_step(
         self, before: PyTree, prior: PyTree, after: PyTree, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
-        """What a sweep back over step k needs: states before it, after `predict` and `correct`, and the innovation.
+        """Return the smoother step k: what the backward pass needs of it.
+
+        Args:
+            before: the filter's state before the step.
+            prior: the state after `predict`.
+            after: the state after `correct`.
+            innovation: the innovation of the correction.
+            z: measurement (received,).
+            u: input (inputs,).
+            k: number of the step.
 
         Raises:
-            ValueError: a filter that keeps no covariance of its own, or does not say how its state moves.
+            ValueError: a filter without a covariance that `correct` updates, or without a known motion of its state.
         """
         raise fail("smoothing", "a filter that keeps its covariance and says how its state moves", type(self).__name__)
 
@@ -109,21 +132,21 @@ class AbstractFilter(Module):
         return self.estimate(state)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
-        """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
+        """Return the same filter for these inputs and complete data, with all that does not depend on z precomputed."""
         return self
 
     def with_past(self, steps: AbstractSmootherStep) -> "AbstractFilter":
-        """A planned filter that can be smoothed: `steps` retained by the filter that it was planned from, over time."""
+        """Return a planned filter that can be smoothed, given the smoother `steps` of the original filter over time."""
         return self
 
     @property
     def of_atoms(self) -> bool:
-        """Whether its likelihood alone says which values its model excludes, being a mixture's."""
+        """True for a mixture over atoms, whose likelihood alone says which values its model excludes."""
         return False
 
     @property
     def horizon(self) -> int | None:
-        """Number of steps that it covers; None if it may go on for ever."""
+        """Number of steps that it covers; None if there is no last one."""
         return steps_covered(self)
 
 
@@ -154,12 +177,12 @@ def _step_with_smoother(
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
-    """Check what a filter's `predict(state, u, k)` is given, hand it arrays, compile it."""
+    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it."""
     return _checked(predict, given)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
-    """Check what a filter's `correct(state, z, k)` is given, hand it arrays, compile it."""
+    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it."""
     return _checked(correct, measured)
 
 
@@ -176,7 +199,9 @@ def _checked(
 
 
 def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
-    """A measurement of the filter's length, NaN where a component did not arrive; empty for a filter that hears none.
+    """Return z as a measurement of the filter's length, NaN where a component did not arrive.
+
+    Empty for a filter that uses no measurements.
 
     Raises:
         ValueError: another shape, infinite values, or no real numbers.
@@ -188,7 +213,7 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
 
 
 def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
-    """An input of the filter's length.
+    """Return u as an input of the filter's length.
 
     Raises:
         ValueError: another shape, values that are not finite, or no real numbers.
@@ -200,7 +225,7 @@ def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
 
 
 def step_number(item: AbstractFilter, k: Step) -> Step:
-    """A number of a step that the filter covers.
+    """Return k as the number of a step that the filter covers.
 
     Raises:
         ValueError: no whole number, a negative one, or one past the end of what varies over time.
@@ -222,7 +247,7 @@ def step_number(item: AbstractFilter, k: Step) -> Step:
 
 
 def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
-    """Real numbers of one axis as an array of floats; a single number will do for a length of one."""
+    """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
     try:
         result: Array = np.asarray(value)
@@ -230,10 +255,12 @@ def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " 
         result = jnp.asarray(value, dtype=float)
     except ValueError:  # rows of different lengths
         raise fail(name, expected, repr(value)[:60]) from None
+    # Concrete values: real numbers only, in double precision.
     if isinstance(result, np.ndarray):
         if result.dtype.kind not in "fiub":
             raise fail(name, expected, repr(value)[:60])
         result = result.astype(np.float64)
+    # A scalar stands for a vector of length one.
     result = result[None] if result.ndim == 0 and length in (1, None) else result
     if result.ndim != 1 or length not in (len(result), None):
         raise fail(name, expected, f"shape {result.shape}" if result.size else "none")

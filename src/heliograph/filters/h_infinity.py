@@ -1,4 +1,4 @@
-"""The H-infinity filter: gains designed for a level, run on any plant and sensor."""
+"""H-infinity filter: gains designed for a level, run on any plant and sensor."""
 
 from typing import NamedTuple
 
@@ -20,17 +20,29 @@ from heliograph.numerics.types import ArrayLike, Float
 
 
 class Pending(NamedTuple):
-    """The last estimate (n,), and the correction (n,) that what came since will make to the next."""
+    """Last estimate (n,), and the correction (n,) by which the last measurement will change the next one."""
 
     mean: Float[jax.Array, " n"]
     correction: Float[jax.Array, " n"]
 
 
 class HInfinityFilter(AbstractFilter):
-    """xhat+ = f(xhat, u) + K (received - E[G] h(xhat)): an estimate at step k uses what came before step k.
+    """H-infinity filter in predictor form, xhat+ = f(xhat, u) + K (z - E[G] h(xhat)).
 
-    It claims no covariance: its guarantee is a ratio of energies over the horizon. What did not arrive counts as what
-    the filter expected. At the first step there is nothing to correct with, and the estimate is f of the initial one.
+    An estimate at step k uses the measurements before step k. There is no covariance to claim: the guarantee is a ratio
+    of energies over the horizon. A component that did not arrive counts as if it equalled its expectation. At the first
+    step there is no correction, and the estimate is f of the initial one.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor.
+        gains: K (n, received) at each step.
+        expected_gain: E[G] at each step.
+        initial_mean: initial estimate (n,).
+        claim: "none".
+        states: names of the plant's states.
+        inputs: names of the plant's inputs.
+        received: length of z.
     """
 
     plant: AnyPlant
@@ -45,19 +57,19 @@ class HInfinityFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Pending:
-        """The initial estimate, with no correction."""
+        """Return the initial estimate, with no correction."""
         mean = jnp.asarray(self.initial_mean)
         return Pending(mean, jnp.zeros_like(mean))
 
     @predicts
     def predict(self, state: Pending, u: ArrayLike = (), k: Step = 0) -> Pending:
-        """Over step k, with what came before it."""
+        """Predict over step k, corrected with the measurements before it."""
         mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
         return Pending(mean, jnp.zeros_like(mean))
 
     @corrects
     def correct(self, state: Pending, z: ArrayLike, k: Step = 0) -> tuple[Pending, Innovation]:
-        """Keep what z will correct in the next estimate; this one stays."""
+        """Compute the correction of the next estimate from z; the current one stays."""
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         later = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
         nothing = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
@@ -65,7 +77,7 @@ class HInfinityFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Pending) -> Estimate:
-        """The mean, without a covariance."""
+        """Mean of the state, without a covariance."""
         n = state.mean.shape[0]
         return Estimate(state.mean, jnp.full((n, n), jnp.nan), self.claim)
 
@@ -75,23 +87,31 @@ def h_infinity_filter(
     sensor: AnySensor,
     system: GrowthSystem,
     design: HInfinityDesign,
-    initial_mean: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
 ) -> HInfinityFilter:
-    """The filter with designed gains; it covers the steps of the system, whose A x + f(x) must be `plant`'s transition.
+    """H-infinity filter with designed gains, over the steps of the system.
 
-    `system` says what the filter expects of the channel. The initial mean is the plant's unless given.
+    Args:
+        plant: the plant, n states, whose transition must be the system's A x + f(x).
+        sensor: its sensor, without angles.
+        system: the error system, with the moments of the channel that the filter assumes (`growth_system`).
+        design: a feasible design of gains (`recursive_design`).
+        initial_mean: initial estimate (n,); the plant's initial mean by default.
 
     Claim: "none" for a covariance; `certify_level` checks the level that it does guarantee.
 
     Raises:
         ValueError: a design that is not feasible, or a plant, sensor and system that do not fit.
+
     Source: H-infinity fusion over amplify-and-forward relays, equation (6).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     instance("design", design, HInfinityDesign, "a design, as recursive_design makes it")
+    # An infeasible design guarantees nothing.
     if not design.feasible:
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
+    # Sizes of plant, sensor and design agree.
     instance("plant", first(plant), AbstractPlant, "a plant")
     start, inputs = first(plant), system.output.shape[1]
     n = len(start.states)
@@ -102,6 +122,7 @@ def h_infinity_filter(
     if len(first(sensor).outputs) != inputs:
         raise fail("sensor", f"the system's {inputs} outputs", len(first(sensor).outputs))
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    # E[G], by which the filter predicts z.
     expected = np.array([link.mean[:, :inputs] for link in system.channel])
     return HInfinityFilter(
         plant=plant,

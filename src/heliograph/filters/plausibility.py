@@ -1,6 +1,6 @@
-"""Whether what came may be used: an innovation's squared distance, and which values are implausible, and why.
+"""Plausibility of data: an innovation's squared distance, which values are implausible, and why.
 
-What is implausible is never committed: a live estimator, a timeline and a recording refuse it and say so.
+An implausible value is never used: a live estimator, a timeline and a recording refuse it and report it.
 """
 
 from enum import IntEnum
@@ -35,7 +35,7 @@ FEW = 36  # numbers of a state of six and its covariance
 
 
 class Reason(IntEnum):
-    """Why something is implausible, in the order of precedence."""
+    """Reasons for which something is implausible, in the order of precedence."""
 
     PLAUSIBLE = 0
     FAR = 1
@@ -54,7 +54,7 @@ INPUT = "with it the mean loses its digits to rounding"
 
 
 class Judgement(NamedTuple):
-    """What is said of one step of a filter.
+    """Judgement of one step of a filter.
 
     distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known; arrived: how
     many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
@@ -68,21 +68,21 @@ class Judgement(NamedTuple):
 
     @property
     def implausible(self) -> Array:
-        """Whether the measurement may not be used."""
+        """True where the measurement must not be used."""
         return self.reason > 0
 
 
 def in_words(reason: float, distance: float) -> str:
-    """Why something is implausible."""
+    """Describe in words why something is implausible."""
     far = Reason(int(reason)) == Reason.FAR and np.isfinite(distance)
     return WORDS[Reason(int(reason))] + (f" ({np.sqrt(distance):.3g} of them)" if far else "")
 
 
 def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-    """Why a measurement is implausible, where some filter finds it so and none can judge it and does not.
+    """Explain why a measurement is implausible: some filter judges it so, and no filter that can judge disagrees.
 
-    One filter that is lost, and finds all implausible, does not keep what came from the others: it alone leaves it out.
-    A filter that claims no covariance judges nothing but its own state.
+    A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it alone
+    skips them. A filter that claims no covariance judges nothing but its state.
     """
     distance, _, reason, _ = votes.T
     bad = reason > 0
@@ -93,7 +93,7 @@ def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
 
 
 def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-    """Why inputs are implausible, by the same rule."""
+    """Explain why inputs are implausible, by the same rule."""
     bad = (votes[:, 3] > 0) | (votes[:, 2] == Reason.PREDICTION)
     if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
         return None
@@ -118,42 +118,46 @@ def judge(
     claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
     innovation: Innovation, z: Float[Array, " m"], of_atoms: bool,
 ) -> Judgement:  # fmt: skip
-    """Judge a step: states and estimates before it, after its prediction and after its correction, and the innovation.
+    """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
-    A value is far where the components that are larger than was expected are more than LIMIT deviations off: one that
-    is smaller takes the mean to where it has more digits, so that an estimate which is far off comes back. It is
-    excluded where nothing of it is free and the model says another, or none of the atoms that a filter is made of
-    leaves it. A state is unsound where the one before it was not:
-    a mean or variance that is no finite number, a negative variance, an infinite number in it.
+    A value is far where the components larger than expected are more than LIMIT deviations off: a smaller one takes the
+    mean to where it has more digits, so that an estimate which is far off can return. It is excluded where all of it is
+    determined and differs from the model, or where no atom of a mixture produces it. A state is unsound where the one
+    before it was not: a mean or variance that is no finite number, a negative variance, an infinite number in it.
     """
     (before, prior, after), value = estimates, jnp.asarray(innovation.value)
     z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
-    z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter that does not listen
+    z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
+    # Squared distance of each component given those before it, and which are determined.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
     every, certain = _squares(value, covariance, present, size)
     distance, count = _total(every), _total(present.astype(value.dtype))
 
+    # Far: components larger than expected, beyond LIMIT deviations.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     part, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
     free = jnp.where(larger & ~determined, part, 0.0)
     far = _some((free > LIMIT**2) | (larger & jnp.isinf(value))) | (_total(free) > LIMIT**2)
+    # Excluded: all determined, and one of them differs.
     excluded = _some(jnp.isinf(every) & certain) & ~_some(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
+    # States that stop being numbers, by the correction or already by the prediction.
     unsound = (_sound(prior, claim, before) & ~_sound(after, claim, prior)) | _overflows(states[1], states[2])
     predicted = (_finite(before, claim) & ~_finite(prior, claim)) | _overflows(states[0], states[1])
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
     reason = jnp.where(unsound & (count > 0) & ~far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)
+    # Inputs that move the mean to where its deviation is below its rounding.
     digits = _some(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
     known = jnp.nan if claim == "none" else digits
     return Judgement(jnp.where(count > 0, distance, jnp.nan), count, reason.astype(value.dtype), jnp.asarray(known))
 
 
 def _some(which: jax.Array) -> jax.Array:
-    """Whether some are true; of few without a loop, which would cost more than all of them."""
+    """Test whether any is true; for few without a loop, which would cost more than the operations themselves."""
     flat = which.reshape(-1)
     if not 0 < len(flat) <= FEW:
         return jnp.any(flat)
@@ -161,7 +165,7 @@ def _some(which: jax.Array) -> jax.Array:
 
 
 def _total(values: jax.Array) -> jax.Array:
-    """Their sum, likewise."""
+    """Sum of values; for few without a loop."""
     if not 0 < len(values) <= FEW:
         return jnp.sum(values)
     return add([jax.lax.index_in_dim(values, i, keepdims=False) for i in range(len(values))])
@@ -182,7 +186,7 @@ def _finite(estimates: Estimate, claim: Claim) -> jax.Array:
 
 
 def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
-    """Finite, and no variance below zero by more than the rounding of what was there before."""
+    """Test for finite numbers, with no variance below zero by more than the rounding of the covariance before."""
     if claim == "none":
         return _finite(estimates, claim)
     left, whole = diagonal_of(jnp.asarray(estimates.covariance)), diagonal_of(jnp.asarray(before.covariance))
@@ -191,7 +195,7 @@ def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Whether some number of a state became infinite."""
+    """Test whether some number of a state became infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
     items = [_some(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
     return reduce(jnp.logical_or, items, jnp.asarray(False))
@@ -202,7 +206,7 @@ def _is_real(leaf: Array) -> bool:
 
 
 def _rounded_away(estimates: Estimate) -> jax.Array:
-    """Of each state whether its deviation is there but below the rounding of its mean."""
+    """Mask of the states whose deviation is positive but below the rounding of their mean."""
     mean = jnp.asarray(estimates.mean)
     variance = diagonal_of(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)

@@ -1,4 +1,4 @@
-"""Several estimates made one: rules, intersection, levels, and quantizers on the way."""
+"""Fusion of several estimates: rules, covariance intersection, H-infinity levels, and quantizers on the uplinks."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The best linear estimate from every report that ever reached the fusion centre: filters at nodes are relays too."""
+"""Best linear estimate from all reports that reached the fusion centre so far, with the nodes' errors as states."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from heliograph.numerics.types import Float
 
 
 class Past(NamedTuple):
-    """Of reports sent 0, 1, ... steps ago: mean gain, offset, noise Cov(z | sent) on average, quantizers' error.
+    """Reports sent 0, 1, ... steps ago: mean gain, offset, mean noise Cov(z | sent), and the quantizers' error.
 
     Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
     """
@@ -31,10 +31,10 @@ class Past(NamedTuple):
 
 
 class Knowledge(NamedTuple):
-    """What the centre knows of zeta = (x, e_1, ..., e_nodes, what the nodes sent one step ago, two steps ago, ...).
+    """Estimate of the centre, of zeta = (x, e_1, ..., e_nodes, reports sent one step ago, two steps ago, ...).
 
-    mean (N,) and covariance (N, N), N = (1 + nodes + nodes delays) n; of errors that quantizers made a bound `spill`
-    on their square, apart: the error of the mean is one of this covariance and one within that bound.
+    mean (N,) and covariance (N, N), N = (1 + nodes + nodes delays) n; `spill` bounds the square of the part of the
+    error that comes from quantizers: the error of the mean is one of this covariance plus one within that bound.
     """
 
     mean: Float[jax.Array, " N"]
@@ -44,43 +44,45 @@ class Knowledge(NamedTuple):
 
 
 class AllReports(AbstractInformedFusion):
-    """A Kalman filter of the plant and of every node's error, which hears the reports x - e_i, in memory of all before.
+    """A Kalman filter of the plant and of every node's error, whose measurements are the reports x - e_i, with memory.
 
-    Where every report arrives it equals the central filter if every gain has full column rank: the centre could compute
-    each measurement back. It knows more than any weights of what is said now, at the price of a state of all errors.
-    Reports that fade, get lost or are late (`ReportLink`), or are quantized, are heard for what they are; one that is
-    late is of what was then sent, which the state holds as long as it may be on its way.
+    Where every report arrives it equals the central filter if every gain has full column rank: the centre could
+    recompute each measurement. It uses more information than weights of the present estimates, at the price of a state
+    of all errors.
+
+    Reports that fade, get lost or are late (`ReportLink`), or are quantized, are modelled as such; a late report is one
+    of the past estimate, which is a state for as long as it may arrive.
 
     Claim: as `MatrixWeights`; "upper" behind quantizers whose error is bounded before any data. Refused where the
-    centre cannot know what happened: nodes that lose measurements behind links that may lack their report.
+    centre cannot know the nodes' gains: nodes that lose measurements behind links that may lack their report.
 
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """
 
     @property
     def uses_reports(self) -> bool:
-        """It does."""
+        """True: it uses reports that fade, are late, or never arrive."""
         return True
 
     def start(self, errors: Errors) -> Knowledge:
-        """Before the first report, over links that deliver what is sent."""
+        """Return the state before the first report, over lossless links."""
         return begin(errors, 0, errors.bias.shape[1], quantized=False)
 
     def use(self, state: Knowledge, happened: Happened, means: Means) -> tuple[Knowledge, Fused]:
-        """Move the plant and all errors, then hear the reports; one that is NaN did not arrive."""
+        """Move the plant and all errors, then use the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
         after, _ = receive_reports(moved(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
         return after, fused_estimate(after, n)
 
 
 def faithful(nodes: int, n: int) -> Links:
-    """Links that deliver what is sent."""
+    """Lossless links, which deliver what is sent."""
     zero = np.zeros((nodes, n))
     return Links(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
 
 
 def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowledge:
-    """Before the first report, where one may be so many steps late; each has `received` numbers."""
+    """Return the state before the first report, for so many `delays` and `received` numbers per report."""
     nodes, n = errors.bias.shape
     size = nodes * n
     local, joint = errors.local.reshape(size, n), errors.joint.reshape(size, size)
@@ -93,19 +95,22 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowle
 
 
 def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
-    """x- = A x + b + w and e+ = T e + G x + g + B w - K nu, together; then each node sends x- - e+."""
+    """Predict x- = A x + b + w and e+ = T e + G x + g + B w - K nu together; then each node sends x- - e+."""
     motion, step, noise, _ = happened
     nodes, n, _ = step.transition.shape
     size = nodes * n
+    # Transition of (x, e_1, ...): A on top, G and T below.
     items = jnp.arange(nodes)
     errors = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(step.transition).reshape(size, size)
     plant = jnp.pad(jnp.asarray(motion.matrix), ((0, 0), (0, size)))
     transition = jnp.concatenate([plant, jnp.concatenate([step.of_state.reshape(size, n), errors], axis=1)])
+    # Noise: w is common to all, nu enters by each node's gain.
     shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
     local = jnp.pad(observation_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
     drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
     new = shared @ motion.noise @ shared.T + local
     later = len(state.mean) - n - size
+    # The line of past reports shifts by one step.
     if later:
         stored = _shifted(nodes, n, later)
         transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
@@ -119,25 +124,27 @@ def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
 
 
 class Expected(NamedTuple):
-    """What the reports were expected to be, (age, node, m) in a row, and the covariance of what they are."""
+    """Predicted mean of the reports, (age, node, m) flattened, and their innovation covariance."""
 
     mean: Float[jax.Array, " M"]
     covariance: Float[jax.Array, "M M"]
 
 
 def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Knowledge, Expected]:
-    """Use the reports that arrived, by how many steps ago they were sent; NaN for those that did not arrive now.
+    """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
     error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`.
     """
     nodes, n = state.past.error.shape[1:]
+    # Innovation, zero for reports that did not arrive.
     values = jnp.ravel(reports)
     output, offset = _output(state.past, len(state.mean)), jnp.ravel(state.past.offset)
     noise = _along_diagonal(state.past.noise)
     present = ~jnp.isnan(values)
     expected = output @ state.mean + offset
     unexpected = jnp.where(present, values - expected, 0.0)
+    # S = O P O' + N.
     cross = output @ state.covariance
     total = cross @ output.T + noise
     if state.spill is None:
@@ -145,10 +152,12 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
         gain = solve_known(_of_present(present, total), cross).T
         covariance = symmetrize(with_rounding(state.covariance, nodes * n) - gain @ cross)
         return Knowledge(state.mean + gain @ unexpected, covariance, state.past, None), Expected(expected, total)
+    # Gain for quantizers' errors as white noise of variance D^2 / 3.
     push = _quantized(state.past, present)
     cross = jnp.where(present[:, None], cross, 0.0)
     wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
     gain = solve_known(_of_present(present, total + wide), cross).T
+    # Joseph form with that gain; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(state.mean)) - gain @ output
     covariance = symmetrize(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
     into = gain @ push
@@ -158,13 +167,13 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
 
 
 def fused_estimate(state: Knowledge, n: int) -> Fused:
-    """The estimate of x, and the covariance or bound of its error."""
+    """Estimate of x, with the covariance of its error or a bound on it."""
     covariance = state.covariance[:n, :n]
     return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
 
 
 def _with_new(past: Past, happened: Happened, links: Links) -> Past:
-    """What is sent now, before what was sent earlier."""
+    """Put the present reports before those of earlier steps."""
     result = happened.errors
     mean = result.mean - result.bias
     blocks = jnp.einsum("iaib->iab", result.joint)
@@ -180,7 +189,7 @@ def _with_new(past: Past, happened: Happened, links: Links) -> Past:
 
 
 def _shifted(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
-    """x - e_i becomes what was sent a step ago, what was sent a step ago becomes what was sent two steps ago."""
+    """Shift matrix of the line: x - e_i becomes the report of one step ago, and so on."""
     size = nodes * n
     sent = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size), np.zeros((size, later))], axis=1)
     shift = np.eye(later - size, n + size + later, n + size)
@@ -188,7 +197,7 @@ def _shifted(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
 
 
 def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:
-    """The reports' mean gains: of x - e_i now, and of what was sent then."""
+    """Output matrix of the reports: mean gains on x - e_i now, and on the reports of earlier steps."""
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
     now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
@@ -202,12 +211,12 @@ def _of_present(present: jax.Array, matrix: jax.Array) -> jax.Array:
 
 
 def _quantized(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
-    """How the quantizers' errors, (age, node, n) in a row, get into the reports that arrived."""
+    """Matrix by which the quantizers' errors, (age, node, n) flattened, enter the reports that arrived."""
     return jnp.where(present[:, None], _along_diagonal(past.gain), 0.0)
 
 
 def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
-    """One block after another, zero elsewhere."""
+    """Block-diagonal matrix of these blocks."""
     ages, nodes, rows, columns = blocks.shape
     items = jnp.arange(ages * nodes)
     empty = jnp.zeros((len(items), rows, len(items), columns))
@@ -222,7 +231,7 @@ def _within(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Flo
 
 
 def _sum(a: jax.Array, b: jax.Array) -> jax.Array:
-    """(1 + s / r) A + (1 + r / s) B above E[(u + v)(u + v)'], the smallest trace: r^2 = tr A, s^2 = tr B (Young)."""
+    """(1 + s / r) A + (1 + r / s) B, a bound on E[(u + v)(u + v)'] of least trace: r^2 = tr A, s^2 = tr B (Young)."""
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     both = (r > 0) & (s > 0)
     ratio = jnp.where(both, s / jnp.where(r > 0, r, 1.0), 1.0)

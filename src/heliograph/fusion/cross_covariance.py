@@ -1,9 +1,11 @@
-"""How the errors of local linear filters are correlated, before any data: they share the plant, and perhaps more.
+"""Cross-covariances of the errors of local linear filters, before any data: they share the plant, and perhaps more.
 
-Filter i predicts m- = F m + f and corrects m = m- + K (z - C m- - c), whatever it believes. The world moves
-x- = A x + b + w and lets it hear z = M x- + o + nu. With e = x - m, U = I - K C and L = K (M - C):
+Filter i predicts m- = F m + f and corrects m = m- + K (z - C m- - c), whatever its model. The world moves
+x- = A x + b + w, and the filter receives z = M x- + o + nu. With e = x - m, U = I - K C and L = K (M - C):
+
   e+ = U F e + [U (A - F) - L A] x + [U (b - f) - L b - K (o - c)] + (U - L) w - K nu.
-Where the filter believes in the world, the second and third term vanish: e+ = (I - K H)(A e + w) - K nu.
+
+Where the filter's model is the world, the second and third term vanish: e+ = (I - K H)(A e + w) - K nu.
 """
 
 from typing import NamedTuple
@@ -20,7 +22,7 @@ SAME = 1e-13  # relative: two matrices that say the same after a few products
 
 
 class Motion(NamedTuple):
-    """The plant over one step, x- = A x + b + w with Q = Cov w: matrix A (n, n), shift b (n,), noise Q (n, n)."""
+    """Plant over one step, x- = A x + b + w with Q = Cov w: matrix A (n, n), shift b (n,), noise Q (n, n)."""
 
     matrix: Float[Array, "n n"]
     shift: Float[Array, " n"]
@@ -28,7 +30,7 @@ class Motion(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What the nodes hear of x after a step, z_i = M_i x + o_i + nu_i; rows that a node has not are zero.
+    """Measurements of all nodes after a step, z_i = M_i x + o_i + nu_i; rows that a node lacks are zero.
 
     Shapes: gain M (node, m, n), offset o (node, m); noise E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes
     share nothing.
@@ -42,7 +44,7 @@ class Observation(NamedTuple):
 class Errors(NamedTuple):
     """Moments of the plant's state x and of the errors e_i = x - m_i, before any data.
 
-    mean E x and covariance Cov x; bias E e_i; own Cov(e_i, x); joint Cov(e_i, e_j).
+    mean E x and covariance Cov x; bias E e_i; local Cov(e_i, x); joint Cov(e_i, e_j).
     """
 
     mean: Float[jax.Array, " n"]
@@ -53,7 +55,7 @@ class Errors(NamedTuple):
 
 
 class ErrorStep(NamedTuple):
-    """e+ = transition e + of_state x + drift + of_noise w - gain nu, for each node."""
+    """Recursion of the errors, e+ = transition e + of_state x + drift + of_noise w - gain nu, for each node."""
 
     transition: Float[jax.Array, "node n n"]
     of_state: Float[jax.Array, "node n n"]
@@ -63,7 +65,7 @@ class ErrorStep(NamedTuple):
 
 
 def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]) -> Errors:
-    """Before the first step: every filter starts at a known place, so all errors are x_0 but for their means."""
+    """Moments before the first step: every filter starts at a known mean, so all errors are x_0 up to a constant."""
     mean, covariance, starts = jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(starts)
     nodes, n = starts.shape
     values = jnp.broadcast_to(covariance, (nodes, n, n))
@@ -72,7 +74,7 @@ def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], st
 
 
 def error_step(local: Plan, motion: Motion, observation: Observation) -> ErrorStep:
-    """The errors' own recursion; `local` has a leading axis of nodes."""
+    """Recursion of the errors of linear filters; `local` has a leading axis of nodes."""
     gain, identity = jnp.asarray(local.gain), jnp.eye(motion.matrix.shape[-1])
     keep = identity - gain @ local.output
     astray = gain @ _difference(observation.gain, local.output)
@@ -91,22 +93,25 @@ def error_step(local: Plan, motion: Motion, observation: Observation) -> ErrorSt
 def moved_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """E x and Cov x after the step: what the nodes hear of depends on it."""
+    """E x and Cov x after the step."""
     matrix = jnp.asarray(motion.matrix)
     return matrix @ mean + motion.shift, matrix @ covariance @ matrix.T + motion.noise
 
 
 def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Errors:
-    """All pairs at once: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and what a wrong belief adds."""
+    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', plus the terms of a wrong model."""
     nodes, n = errors.bias.shape
     mean, covariance = moved_state(errors.mean, errors.covariance, motion)
     bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
+    # Cov(e+, x+): the errors depend on x where a filter's model is wrong.
     carried = step.transition @ errors.local  # Cov(T e, x)
     of_state = step.of_state @ errors.covariance
     of_noise = step.of_noise @ motion.noise
     local = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
+    # Terms of x and w in Cov(e_i+, e_j+), as one product of all nodes.
     left = jnp.concatenate([carried + of_state, step.of_state, of_noise], axis=-1).reshape(nodes * n, -1)
     right = jnp.concatenate([step.of_state, carried, step.of_noise], axis=-1).reshape(nodes * n, -1)
+    # T_i P_ij T_j'.
     once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     joint = (both + left @ right.T).reshape(nodes, n, nodes, n)
@@ -114,10 +119,11 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
 
 
 class Factors(NamedTuple):
-    """The same by its sources: x = E x + state s, e_i = E e_i + shared_i s + what is node i's own, s white with Cov I.
+    """Moments of the errors by their sources: x = E x + state s, e_i = E e_i + shared_i s + a_i, Cov s = I.
 
-    s are x_0 and the process noise of each step, and what the channels add where nodes share them. So Cov(e_i, e_j) =
-    shared_i shared_j' + (own_i if i is j): a step costs as much as there are nodes, not pairs of them.
+    s are x_0 and the process noise of each step, and the channels' noise where nodes share it; a_i is independent, of
+    covariance local_i. So Cov(e_i, e_j) = shared_i shared_j' + (local_i if i is j): a step costs in proportion to the
+    nodes, not to pairs of them.
     """
 
     mean: Float[jax.Array, " n"]
@@ -128,7 +134,7 @@ class Factors(NamedTuple):
 
 
 def initial_factors(errors: Errors, sources: int) -> Factors:
-    """Before the first step, with room for so many sources: all is the deviation of x_0."""
+    """Factors before the first step, with room for `sources` more: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.covariance))
     shared = jnp.broadcast_to(state, (nodes, *state.shape))
@@ -136,14 +142,16 @@ def initial_factors(errors: Errors, sources: int) -> Factors:
 
 
 def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Array, k: jax.Array) -> Factors:
-    """Over step k: s gets the process noise, and the noise of what is heard where nodes share it."""
+    """Propagate over step k: s gets the process noise, and the measurement noise where nodes share it."""
     nodes, n = factors.bias.shape
+    # x+ and e+ in terms of the sources so far.
     root = cholesky(jnp.asarray(motion.noise))
     state = jnp.asarray(motion.matrix) @ factors.state
     shared = step.transition @ factors.shared + step.of_state @ factors.state
     bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
     moved = step.transition @ factors.local @ jnp.swapaxes(step.transition, 1, 2)
     new = step.of_noise @ root
+    # Shared measurement noise is a source, independent noise is local.
     if noise.ndim == 4:
         m = noise.shape[1]
         received = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
@@ -151,6 +159,7 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
         root = jnp.pad(root, ((0, 0), (0, nodes * m)))
     else:
         moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
+    # The new sources of step k go to columns of their own.
     place = n + new.shape[-1] * k
     return Factors(
         jnp.asarray(motion.matrix) @ factors.mean + motion.shift,
@@ -172,11 +181,11 @@ def observation_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float
 
 
 def _difference(a: Array, b: Array) -> jax.Array:
-    """a - b, zero where it is rounding: a filter that believes in the world must not be told that it errs with x."""
+    """a - b, zero where it is rounding, so that a filter with the right model has no error that depends on x."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)
 
 
 def _times(matrix: Array, vector: Array) -> jax.Array:
-    """One product for each node."""
+    """Product of matrix and vector for each node."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

@@ -1,4 +1,4 @@
-"""The quantizer that doubles its reach where a value is beyond it: what one end sends, and what the other decodes."""
+"""Quantizer that doubles its amplitude for a value outside it: encoder and decoder."""
 
 from typing import NamedTuple
 
@@ -16,10 +16,10 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
 class Symbols(NamedTuple):
-    """What goes over the uplink for one value, by component.
+    """Symbols sent over the uplink for one value, by component.
 
-    How many escapes, then the segment from 0: -1 says that there is no number, `ABOVE` and `BELOW` that it is beyond
-    all that numbers hold. `number` counts the values that were sent; `restart` says that the first amplitude is used.
+    How many escapes, then the segment from 0: -1 for NaN, `ABOVE` and `BELOW` for a value beyond the range of numbers.
+    `number` counts the values that were sent; `restart` says that the first amplitude is used.
     """
 
     escapes: Int[Array, "*n"]
@@ -33,7 +33,7 @@ LOST = -1  # the number of the next value for a receiver that has missed one
 
 
 class UplinkState(NamedTuple):
-    """What one end of an uplink knows, by component: the next amplitude, and the number of the next value.
+    """State of one end of an uplink, by component: the next amplitude, and the number of the next value.
 
     A receiver that has missed a value does not know the amplitude: `number` is negative then.
     """
@@ -43,26 +43,34 @@ class UplinkState(NamedTuple):
 
     @property
     def synchronised(self) -> Bool[Array, "*n"]:
-        """Whether the end knows the amplitude."""
+        """True where the end knows the amplitude."""
         return self.number >= 0
 
 
 class EscapeQuantizer(AbstractQuantizer):
-    """A quantizer that the receiver can decode and that does not saturate, driven by nothing but what was sent.
+    """A decodable quantizer that does not saturate, driven by nothing but what was sent.
 
     Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
     Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
     d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one. Only a value whose d 2^m would
     be no number saturates.
 
-    A value that is lost on the way leaves the receiver with a wrong d. It finds that from the number of the next one:
+    A value that is lost on the way leaves the receiver with a wrong d. It detects that from the number of the next one:
     from then on it delivers NaN, without an error bound, and its state is not `synchronised`, until the sender restarts
-    from the first amplitude. That is so with every `interval`-th value, and with any that `encode` is told to restart
-    with. So after a loss the error bound holds again within `interval` values; without either, never.
+    from the first amplitude. That is so with every `interval`-th value, and with any that `encode` restarts with. So
+    after a loss the error bound holds again within `interval` values; without either, never.
+
+    Args:
+        levels: odd number of segments, at least 3.
+        amplitude: first amplitude, a number or (n,).
+        decay: factor of the amplitude, in (0, 1); a number or (n,).
+        growth: factor of the sent value in the next amplitude, from 0; a number or (n,).
+        smallest: least amplitude, a number or (n,).
+        interval: number of values between restarts; None, the default, never restarts.
 
     Raises:
         ValueError: an even number of levels or fewer than three, amplitude or smallest amplitude not positive or beyond
-            what numbers hold, decay outside (0, 1), negative growth, an interval below 1.
+            the range of numbers, decay outside (0, 1), negative growth, an interval below 1.
     """
 
     levels: Float[Array, ""]
@@ -75,10 +83,10 @@ class EscapeQuantizer(AbstractQuantizer):
     def __init__(
         self,
         levels: int,
-        amplitude: ArrayLike,
-        decay: ArrayLike,
-        growth: ArrayLike,
-        smallest: ArrayLike,
+        amplitude: Float[ArrayLike, "*n"],
+        decay: Float[ArrayLike, "*n"],
+        growth: Float[ArrayLike, "*n"],
+        smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
         self.levels = levels_of(levels)
@@ -92,21 +100,22 @@ class EscapeQuantizer(AbstractQuantizer):
 
     @in_float64
     def init(self, n: int) -> UplinkState:
-        """The first amplitude, known to both ends."""
+        """Return the first amplitude, known to both ends."""
         count = check_count("components", n)
         return UplinkState(jnp.broadcast_to(jnp.asarray(self.amplitude), (count,)), jnp.zeros(count, int))
 
     @in_float64
     def step(self, state: UplinkState, value: ArrayLike) -> tuple[UplinkState, Quantized]:
-        """What the receiver decodes of what the sender encodes."""
+        """Encode a value at the sender and decode it at the receiver."""
         return self.decode(state, self.encode(state, value))
 
     @in_float64
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
-        """The sender: symbols of a value (n,), from the amplitude that both ends know, or from the first one."""
+        """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
         x = jnp.asarray(value, dtype=float)
         anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
         amplitude = self._amplitude(state, anew)
+        # m = ceil(log2(|x| / d)) by exponents, without rounding.
         (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
         most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
@@ -119,14 +128,17 @@ class EscapeQuantizer(AbstractQuantizer):
 
     @in_float64
     def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
-        """The receiver: next state and value, from the present state and the symbols alone."""
+        """Decode at the receiver: next state and value, from the present state and the symbols alone."""
         escapes, segment, number, restart = (jnp.asarray(part) for part in symbols)
         restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        # A missed number means a wrong amplitude, until a restart.
         synchronised = restart | (state.number == number)
+        # Midpoint of the segment at the doubled amplitude d 2^m.
         used = jnp.ldexp(self._amplitude(state, restart), escapes)
         inside = midpoint(segment, used, self.levels)
         sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
         largest = np.finfo(used.dtype).max
+        # Next amplitude max(smallest, decay d 2^m + growth |sent|).
         following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
         known = there & synchronised
         value = jnp.where(known, sent, jnp.nan)
@@ -144,7 +156,7 @@ class EscapeQuantizer(AbstractQuantizer):
         return jnp.where(restart, self.amplitude, state.amplitude)
 
     def claim(self, claim: Claim) -> Claim:
-        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
+        """Lower a claim to "nominal": the amplitude depends on the data, and may be small where errors are large."""
         return weakest([claim, "nominal"])
 
 

@@ -1,4 +1,4 @@
-"""Sending on event: a node reports when its estimate has changed by more than a threshold since its last report."""
+"""Event-triggered reports: a node reports when its estimate has changed by more than a threshold."""
 
 from typing import NamedTuple
 
@@ -16,20 +16,23 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 
 class LastSent(NamedTuple):
-    """The value that was sent last, and whether there is one."""
+    """Value that was sent last, and whether there is one."""
 
     value: Float[jax.Array, " n"]
     any: Bool[jax.Array, ""]
 
 
 class EventSending(AbstractQuantizer):
-    """Send x, all of it, when some |x_j - held_j| > threshold_j, held what was sent last; the first value is sent.
+    """Event trigger: send x, all of it, when some |x_j - last_j| > threshold_j, and the first value.
 
-    `announced`: the receiver knows the thresholds, so that silence says that x is within them of what it holds. That
-    error
-    bound is used at every step, so that it does not depend on the data: what was "exact" or "upper" becomes "upper".
-    Without, silence is taken for a loss: what the receiver then claims is for losses that do not depend on the data,
-    and these do; the claim is "nominal". A value of n components counts as n symbols when it is sent, else as none.
+    A value of n components counts as n symbols when it is sent, else as none.
+
+    Args:
+        threshold: positive, a number or (n,).
+        announced: whether the receiver knows the thresholds, so that silence means that x is within them of the last
+            value; True by default. That error bound is used at every step, so that it does not depend on the data: what
+            was "exact" or "upper" becomes "upper". Otherwise silence is taken for a loss: the receiver's claim is for
+            losses that do not depend on the data, and these do; the claim is "nominal".
 
     Raises:
         ValueError: thresholds that are not positive.
@@ -38,7 +41,7 @@ class EventSending(AbstractQuantizer):
     threshold: Float[Array, "..."]
     announced: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, threshold: ArrayLike, announced: bool = True):
+    def __init__(self, threshold: Float[ArrayLike, "*n"], announced: bool = True):
         self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)
@@ -46,17 +49,17 @@ class EventSending(AbstractQuantizer):
 
     @property
     def silent(self) -> bool:
-        """Whether nothing may arrive."""
+        """True where a step may pass without a value for the receiver."""
         return not self.announced
 
     @in_float64
     def init(self, n: int) -> LastSent:
-        """Nothing was sent."""
+        """Return the state before the first value."""
         return LastSent(jnp.zeros(n), jnp.asarray(False))
 
     @in_float64
     def step(self, state: LastSent, value: ArrayLike) -> tuple[LastSent, Quantized]:
-        """What the receiver holds after this step; NaN where it takes silence for a loss."""
+        """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss."""
         x = jnp.asarray(value, dtype=float)
         there = ~jnp.any(jnp.isnan(x))
         sent = there & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
@@ -68,10 +71,10 @@ class EventSending(AbstractQuantizer):
         )
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """The thresholds, where silence is understood."""
+        """Thresholds as the error bound, where silence is interpreted; zero otherwise."""
         bound = library(self.threshold).broadcast_to(self.threshold, (n,))
         return bound if self.announced else np.zeros(n)
 
     def claim(self, claim: Claim) -> Claim:
-        """At most "upper", where silence is understood; else "nominal"."""
+        """Lower a claim to "upper" at most where silence is interpreted; else to "nominal"."""
         return weakest([claim, "upper" if self.announced else "nominal"])

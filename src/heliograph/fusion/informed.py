@@ -1,4 +1,4 @@
-"""Fusion by rules that know how the local errors are correlated: best weights of what the nodes say now."""
+"""Fusion with the joint covariance of the local errors: best weights of the present estimates."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ Joint = Float[jax.Array, "node n node n"]
 
 
 class Happened(NamedTuple):
-    """What a fusion centre knows of one step: how plant and errors moved, E[nu nu'], and their moments after it."""
+    """One step as the fusion centre knows it: motion of plant and errors, E[nu nu'], and their moments after it."""
 
     motion: Motion
     step: ErrorStep
@@ -26,18 +26,18 @@ class Happened(NamedTuple):
 
 
 class AbstractInformedFusion(AbstractFusion):
-    """A rule that needs the joint covariance of the local errors; a `Network` carries it along and hands it over.
+    """A rule that needs the joint covariance of the local errors; a `Network` propagates it for the rule.
 
-    `start` is the rule's own state before the first step, `use` what it makes of the reports of one step.
+    `start` is the rule's state before the first step, `use` updates it with the reports of one step.
     """
 
     @property
     def needs_plant_moments(self) -> bool:
-        """Whether it needs the mean and the covariance of the plant's state before any data."""
+        """True if it needs the mean and the covariance of the plant's state before any data."""
         return False
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refused: what the local claims say of each error alone says nothing of the joint covariance."""
+        """Refused: the local claims do not determine the joint covariance."""
         raise self._lacking()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -45,11 +45,11 @@ class AbstractInformedFusion(AbstractFusion):
         raise self._lacking()
 
     def start(self, errors: Errors) -> PyTree:
-        """State before the first step."""
+        """Return the rule's state before the first step."""
         return ()
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
-        """Next state, fused mean and covariance, from the nodes' means after a step."""
+        """Return next state, fused mean and covariance, from the nodes' means after a step."""
         raise NotImplementedError
 
     def _lacking(self) -> ValueError:
@@ -60,23 +60,23 @@ class AbstractInformedFusion(AbstractFusion):
 class AbstractWeights(AbstractInformedFusion):
     """x = sum_i W_i x_i with sum_i W_i = I, best for the joint covariance P of the errors, which is then W P W'.
 
-    Known means of the errors are taken off. `with_mean`: the plant's own mean before any data is one estimate more; it
-    costs nothing, and no direction gets worse for it.
+    Known means of the errors are subtracted. `with_mean`: the plant's mean before any data is one estimate more; it
+    costs no communication, and no direction gets worse.
     """
 
     with_mean: eqx.AbstractVar[bool]
 
     @property
     def needs_plant_moments(self) -> bool:
-        """For the plant's own mean."""
+        """True if the plant's mean is one of the estimates."""
         return self.with_mean
 
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
-        """W from P."""
+        """Compute W from P."""
         raise NotImplementedError
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
-        """Weigh what is said now."""
+        """Weight the present estimates."""
         result = happened.errors
         unbiased, joint = jnp.asarray(means) + result.bias, result.joint
         if self.with_mean:
@@ -89,16 +89,20 @@ class AbstractWeights(AbstractInformedFusion):
 
 
 def with_mean(errors: Errors) -> Joint:
-    """Joint covariance of the errors and of x - E x, the error of the plant's own mean."""
+    """Joint covariance of the errors and of x - E x, the error of the plant's mean."""
     column = errors.local[:, :, None, :]
     last = jnp.concatenate([jnp.moveaxis(errors.local, 2, 0), errors.covariance[:, None, :]], axis=1)
     return jnp.concatenate([jnp.concatenate([errors.joint, column], axis=2), last[None]], axis=0)
 
 
 class MatrixWeights(AbstractWeights):
-    """The best linear unbiased estimate: a matrix weight for each node.
+    """Best linear unbiased fusion: a matrix weight for each node.
 
-    Claim: "exact" in a network of linear filters behind known laws that forget; needs what a `Network` knows.
+    Args:
+        with_mean: whether the plant's mean before any data is one estimate more; False by default.
+
+    Claim: "exact" in a network of linear filters behind known laws without memory; needs the moments that a `Network`
+    propagates.
 
     Source: Bar-Shalom and Campo, The effect of the common process noise on the two-sensor fused-track covariance
     (1986); Sun and Deng, Multi-sensor optimal information fusion Kalman filter (2004).
@@ -107,12 +111,15 @@ class MatrixWeights(AbstractWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
-        """Matrices."""
+        """Matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
 
 class DiagonalWeights(AbstractWeights):
-    """The best unbiased weights of each component by itself: cheaper, and never better than `MatrixWeights`.
+    """Best unbiased fusion component by component: cheaper than `MatrixWeights`, and never better.
+
+    Args:
+        with_mean: whether the plant's mean before any data is one estimate more; False by default.
 
     Claim: as `MatrixWeights`.
 
@@ -122,12 +129,17 @@ class DiagonalWeights(AbstractWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
-        """Diagonal matrices."""
+        """Diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
 
 
 class ScalarWeights(AbstractWeights):
-    """One number for each node, the best for the trace (so units matter); poor where nodes see different states.
+    """Best unbiased fusion with one number per node, for the trace.
+
+    The trace depends on units; poor where nodes see different states.
+
+    Args:
+        with_mean: whether the plant's mean before any data is one estimate more; False by default.
 
     Claim: as `MatrixWeights`.
 
@@ -137,5 +149,5 @@ class ScalarWeights(AbstractWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
-        """Numbers."""
+        """Scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)

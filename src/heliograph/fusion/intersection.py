@@ -1,4 +1,4 @@
-"""Covariance intersection on arrays: the intersection itself, and the weights that make its trace smallest."""
+"""Covariance intersection on arrays: the intersection itself, and the weights of least trace."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding
 LOOP = 1000  # units of rounding below which the certificate makes no progress
 ITERATIONS = 60  # of the interior point method; it needs about 12
 STEP_BACK = 0.99  # share of the way to the boundary
-KNOWN = 1e-8  # of a variance: what stands for none, so that neither it nor the rounding beside it is more than this
+KNOWN = 1e-8  # of a variance: what replaces zero, so that neither it nor the rounding of others exceeds this
 SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks to 1e-8, the flat minimum to 1e-16
 
 
@@ -39,8 +39,8 @@ def intersect(
 ) -> tuple[Float[jax.Array, "n *#runs"], Float[jax.Array, "n n *#runs"]]:
     """x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
 
-    Differences of the means, since what multiplies them has lost the digits that nearly dependent components cost: the
-    means themselves may be millions of deviations from zero.
+    Differences of the means are used, since the matrices that multiply them have lost the digits that nearly dependent
+    components cost: the means themselves may be millions of deviations from zero.
     """
     covariance = inverse(_weighted(weights, information))
     off = add([w * times_vector(j, x - means[0]) for w, j, x in zip(weights, information, means, strict=True)])
@@ -58,6 +58,7 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> 
     iteration stops when this certificate is below GAP tr P.
     """
     count = information.shape[0]
+    # Unit trace on average, so that the start of the multipliers fits.
     scaled = information / (add([trace(j) for j in information]) / count)
 
     def step(carry: _Progress) -> _Progress:
@@ -65,11 +66,13 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> 
         value, gradient, hessian = _trace_derivatives(scaled, w)
         slack = jnp.where(iteration == 0, gradient - jnp.min(gradient, axis=0) + 0.1 * value, slack)
         moved = _newton_step(_Point(w, slack, gradient, hessian))
+        # Certificate of the excess; a run below it stays where it is.
         going = jnp.max(-gradient, axis=0) > (1 + rounding(GAP, value, LOOP)) * value
         w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
         return w, slack, going, iteration + 1  # a run that has arrived stays where it is
 
     runs = information.shape[3:]
+    # From equal weights, which are inside the simplex.
     w = jnp.full((count, *runs), 1 / count)
     start = w, jnp.zeros_like(w), jnp.ones(runs, bool), jnp.asarray(0)
     w, *_ = jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[3] < ITERATIONS), step, start)
@@ -126,6 +129,7 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
     root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish
+    # Hessian + diag(s / w), scaled to root(w) (.) root(w).
     matrix = root[:, None] * point.hessian * root[None] + diagonal(slack)
     solve = solver(matrix)
     ones = root * solve(root[:, None])[:, 0]
@@ -135,9 +139,11 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
         move = solved - jnp.sum(solved, axis=0) / jnp.sum(ones, axis=0) * ones
         return move, (target - slack * move) / w - slack
 
+    # Predictor: the step with target 0.
     present = jnp.mean(w * slack, axis=0)
     move, slack_move = direction(jnp.zeros_like(w))
     ahead = jnp.mean((w + _longest(w, move) * move) * (slack + _longest(slack, slack_move) * slack_move), axis=0)
+    # Corrector: centred, less the predictor's second-order term.
     target = present * jnp.clip(ahead / present, 0.0, 1.0) ** 3 - move * slack_move
     move, slack_move = direction(target)
     length = jnp.minimum(_longest(w, move), _longest(slack, slack_move))
@@ -192,11 +198,11 @@ def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]
 
 
 def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
-    """P_k^-1 of several covariances of one state; what an estimate knows exactly is taken as known to KNOWN.
+    """P_k^-1 of several covariances of one state; components that an estimate knows exactly count as known to KNOWN.
 
-    A component of which those before it leave less than KNOWN of its own variance has KNOWN of it more, and one that is
-    known by itself KNOWN of the largest variance that any of the estimates has for it (1 where all know it): the limit,
-    to KNOWN of each component's own scale, and never less.
+    A component with less than KNOWN of its variance left, given those before it, gets KNOWN of it added; a component of
+    variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
+    limit, to KNOWN of each component's scale, and never less.
     """
     local = jnp.diagonal(matrices, axis1=1, axis2=2)
     largest = jnp.max(local, axis=0)
@@ -214,6 +220,6 @@ def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
 def without_known(
     covariance: Float[jax.Array, "n n"], inputs: Float[jax.Array, "count n n"]
 ) -> Float[jax.Array, "n n"]:
-    """The fused covariance, exactly zero for a component that one of the inputs knows exactly."""
+    """Fused covariance, exactly zero for a component that an input knows exactly."""
     known = jnp.any(jnp.diagonal(inputs, axis1=1, axis2=2) == 0, axis=0)
     return jnp.where(known[:, None] | known, 0.0, covariance)

@@ -1,4 +1,4 @@
-"""Attenuation levels of a weighted fusion: what H-infinity guarantees of the local filters say about the fused one.
+"""Attenuation levels of a weighted fusion, from the H-infinity guarantees of the local filters.
 
 A filter has the level gamma on an output z = M x if its error obeys ||z - zhat|| <= gamma ||w|| for every disturbance,
 where ||.|| is the root of the summed (expected) energy over the horizon and w holds noises and initial errors.
@@ -10,14 +10,15 @@ from heliograph.numerics.check import array, fail, probabilities
 from heliograph.numerics.types import ArrayLike, Float
 
 
-def level_weights(levels: ArrayLike) -> Float[np.ndarray, "N"]:
+def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
 
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
-    linear in c: there the best single node is best.
+    linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
 
     Raises:
         ValueError: levels that are not positive.
+
     Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
     """
     gamma = _levels(levels)
@@ -25,13 +26,15 @@ def level_weights(levels: ArrayLike) -> Float[np.ndarray, "N"]:
     return np.asarray(inverse / inverse.sum())
 
 
-def fused_level(levels: ArrayLike, weights: ArrayLike) -> float:
-    """sum_i c_i gamma_i: the level of a weighted fusion without quantization, when all see disturbances of one norm.
+def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
+    """sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
 
-    The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level.
+    The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
+    the gamma_i, `weights` (N,) the c_i.
 
     Raises:
         ValueError: levels that are not positive, weights off the simplex or not as many.
+
     Source: Minkowski's inequality, in place of H-infinity quantized fusion, equation (34).
     """
     gamma, c = _levels_and_weights(levels, weights)
@@ -39,7 +42,11 @@ def fused_level(levels: ArrayLike, weights: ArrayLike) -> float:
 
 
 def fused_error_norm(
-    levels: ArrayLike, weights: ArrayLike, disturbances: ArrayLike, matrix: ArrayLike, errors: ArrayLike
+    levels: Float[ArrayLike, " N"],
+    weights: Float[ArrayLike, " N"],
+    disturbances: Float[ArrayLike, " N"],
+    matrix: Float[ArrayLike, "outputs n"],
+    errors: Float[ArrayLike, "N time n"],
 ) -> float:
     """Bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
 
@@ -47,13 +54,20 @@ def fused_error_norm(
     component; ||D_i|| is the root of the sum over steps and components. NaN where a quantizer saturated: its D is NaN,
     and nothing is guaranteed.
 
-    Shapes: levels, weights, disturbances ||w_i|| (N,); matrix M (outputs, n); errors D (N, time, n).
+    Args:
+        levels: gamma_i (N,).
+        weights: c_i (N,), on the simplex.
+        disturbances: norms ||w_i|| (N,).
+        matrix: output matrix M (outputs, n).
+        errors: bounds D_i of the quantizers (N, time, n).
 
     Raises:
         ValueError: levels that are not positive, weights off the simplex, negative norms or errors, shapes that do not
             fit.
+
     Source: Minkowski's inequality, in place of H-infinity quantized fusion, equations (34) to (37).
     """
+    # Shapes and signs.
     gamma, c = _levels_and_weights(levels, weights)
     norms, m = array("disturbances", disturbances, (len(gamma),)), array("output matrix", matrix, (None, None))
     d = np.asarray(errors, dtype=np.float64)
@@ -61,6 +75,7 @@ def fused_error_norm(
         raise fail("errors", f"shape ({len(gamma)}, any, {m.shape[1]})", f"shape {d.shape}")
     if np.any(norms < 0) or np.any(d < 0):
         raise fail("disturbances and errors", "no negative number", float(min(norms.min(), np.nanmin(d))))
+    # ||M|| ||D_i||.
     quantization = np.linalg.norm(m, 2) * np.sqrt(np.sum(d**2, axis=(1, 2)))
     return float(c @ (gamma * norms + quantization))
 

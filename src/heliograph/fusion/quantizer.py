@@ -1,4 +1,4 @@
-"""Quantizers on the uplinks from filters to a fusion centre: what arrives, and how far it can be off."""
+"""Quantizers on the uplinks from filters to a fusion centre: received values and their error bounds."""
 
 from typing import NamedTuple
 
@@ -17,10 +17,10 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 @readable
 class Quantized(NamedTuple):
-    """What a quantizer delivers of a value x, by component.
+    """Quantized value of x, by component.
 
     value; error, a guaranteed bound on |value - x| (to rounding), NaN where nothing is guaranteed; saturated, whether x
-    was beyond the reach; symbols, how many were sent.
+    was beyond the amplitude; symbols, how many were sent.
     """
 
     value: Float[Array, "*n"]
@@ -34,25 +34,24 @@ class AbstractQuantizer(Module):
     """A quantizer of vectors: `init(n)` gives the state before any value, `step` the next state and what arrives.
 
     Deterministic, and by component: values of further axes (run, time) go through alike. Parameters are numbers, or
-    (n,) for each component its own. A value that is NaN arrives as NaN and
-    leaves the state alone.
+    (n,), one per component. A value that is NaN arrives as NaN and leaves the state alone.
     """
 
     @property
     def silent(self) -> bool:
-        """Whether nothing may arrive of a value."""
+        """True if a value may not arrive."""
         return False
 
     def init(self, n: int) -> PyTree:
-        """State before the first value, for values of n components."""
+        """Return the state before the first value, for values of n components."""
         raise NotImplementedError
 
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
-        """Next state, and what arrives of a value (n,)."""
+        """Return the next state, and what arrives of a value (n,)."""
         raise NotImplementedError
 
     def claim(self, claim: Claim) -> Claim:
-        """What the widened covariance of a quantized estimate claims, from what the estimate's own claims."""
+        """Claim of the widened covariance of a quantized estimate, from the claim of the estimate."""
         raise NotImplementedError
 
     def error(self, n: int) -> Float[Array, " n"]:
@@ -76,7 +75,7 @@ Quantizer = TypeAliasType("Quantizer", AbstractQuantizer | OverTime)  # an OverT
 
 
 def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
-    """Bound on the covariance of x - q from that, P, of x - xhat (or a bound), where |q - xhat| <= D by component.
+    """Bound on the covariance of x - q, from that of x - xhat (or a bound) P, where |q - xhat| <= D by component.
 
     With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So
     E[(x - q)(x - q)'] <= (1 + t) P + (1 + 1/t) s diag(D) for every t > 0, with the smallest trace (r + s)^2 at

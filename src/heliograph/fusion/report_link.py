@@ -1,4 +1,4 @@
-"""How a node's reports travel to the fusion centre: how often, through what, how late."""
+"""Links of reports from nodes to the fusion centre: rate, channel and delay."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -18,15 +18,17 @@ from heliograph.random_affine.base import AbstractRandomAffine
 
 @readable
 class ReportLink(Module):
-    """A node's report m is sent after every d-th step, arrives as G m + n, and perhaps late.
-
-    `channel`: any random affine map that forgets: fading hops, chains of them, losses that the centre is told of
-    (`erasure`) or not (`dropout`); as it is unless given. `delay`: a number of steps, or the probabilities of 0, 1, ...
-    steps, drawn anew for each report; the centre knows when a report was sent. `every`: reports are sent after the
-    steps d, 2 d, ...
+    """Link of a node's reports: report m is sent after every d-th step, arrives as G m + n, and perhaps late.
 
     A quantizer with dither adds noise that does not depend on the signal: a `hop` of gain 1 whose noise is the
     dither's.
+
+    Args:
+        channel: any random affine map without memory: fading hops, chains of them, losses that the centre detects
+            (`erasure`) or not (`dropout`); lossless by default.
+        delay: a number of steps, or the probabilities (ages,) of 0, 1, ... steps, drawn independently for each report;
+            the centre knows when a report was sent. 0 by default.
+        every: reports are sent after the steps d, 2 d, ...; 1 by default.
 
     Raises:
         ValueError: a channel that is none, a delay that is no count and no probabilities, d below one.
@@ -36,7 +38,7 @@ class ReportLink(Module):
     delay: Float[np.ndarray, " ages"]
     every: int = eqx.field(static=True)
 
-    def __init__(self, channel: Channel | None = None, delay: ArrayLike = 0, every: int = 1):
+    def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
         self.channel, self.every = channel, check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")
@@ -47,7 +49,7 @@ class ReportLink(Module):
             self.delay = probabilities("delay of a report link", delay)
 
     def check(self, n: int) -> None:
-        """Raise ValueError unless it takes reports of n components and forgets."""
+        """Raise ValueError unless it takes reports of n components and has no memory."""
         if self.channel is None:
             return
         if first(self.channel).inputs != n:
@@ -59,11 +61,11 @@ class ReportLink(Module):
 
     @property
     def may_lack(self) -> bool:
-        """Whether a step may pass without the report of that step."""
+        """True if a step may pass without the report of that step."""
         return self.every > 1 or self.delay[0] < 1 or (self.channel is not None and first(self.channel).erases)
 
     def received(self, n: int) -> int:
-        """How many numbers of a report of n arrive."""
+        """Number of received components of a report of n."""
         return n if self.channel is None else int(first(self.channel).outputs)
 
 
@@ -71,7 +73,7 @@ ReportLinks = ReportLink | Mapping[str, ReportLink]  # one for all nodes, or by 
 
 
 class Links(NamedTuple):
-    """What a centre knows of the reports of one step, z_i = G_i m_i + n_i, |what a quantizer adds to m_i| <= error_i.
+    """Reports of one step as the centre models them, z_i = G_i m_i + n_i, quantizers' errors on m_i within error_i.
 
     Shapes: gain E[G] (node, m, n), offset E[n] (node, m), spread (node, m, m, n + 1, n + 1), which takes second moments
     of (m_i, 1) to Cov(z_i | m_i); error (node, n).

@@ -1,4 +1,4 @@
-"""Fusion of estimates whose errors are correlated in unknown ways: covariance intersection and its relatives."""
+"""Fusion of estimates with unknown cross-correlations: covariance intersection and its relatives."""
 
 from collections.abc import Mapping, Sequence
 
@@ -32,33 +32,39 @@ Fused = tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]
 
 @readable
 class AbstractFusion(Module):
-    """A rule that makes one estimate of several.
+    """Rule that fuses several estimates of one state.
 
     A fused claim is never stronger than the weakest of its inputs; what else a rule assumes is in `claim`.
     """
 
     @property
     def uses_reports(self) -> bool:
-        """Whether it makes something of reports that fade, are late, or never arrive."""
+        """True if it uses reports that fade, are late, or never arrive."""
         return False
 
     def check(self, count: int) -> None:
         """Raise ValueError if the rule cannot fuse this number of estimates."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """What the fused covariance claims, from what the inputs claim."""
+        """Claim of the fused covariance, from the claims of the inputs."""
         raise NotImplementedError
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Fused mean and covariance."""
+        """Return fused mean (n,) and covariance (n, n) of means (count, n) and covariances (count, n, n)."""
         raise NotImplementedError
 
 
 def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] = ()) -> Estimate:
-    """Fuse estimates of one state; leading axes (run, time) are carried along. `angles`: which states are angles.
+    """Fuse estimates of one state; leading axes (run, time) are carried along.
+
+    Args:
+        rule: the fusion rule, such as `CovarianceIntersection()`.
+        estimates: estimates of one state, with means (..., n) and covariances (..., n, n).
+        angles: which states are angles, by place; none by default.
 
     Raises:
         ValueError: no estimates, estimates of different state dimensions, angles that are no places in the state.
+
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
     instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
@@ -67,11 +73,13 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] 
     if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
+    # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
     which = tuple(int(i) for i in array("angles", items("angles", angles, "places"), (None,)))
     if not set(which) <= set(range(means.shape[-1])):
         raise fail("angles", f"places from 0 to {means.shape[-1] - 1}", list(which))
     means = nearest(means, means[..., :1, :], which)
+    # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
     mean, covariance = _combine_all(rule, means, covariances)
     return Estimate(wrapped(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
@@ -92,13 +100,13 @@ class CovarianceIntersection(AbstractFusion):
 
     P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, w on the simplex; tr P is convex in w. An upper bound for
     any correlation if the inputs are and if weights do not depend on the data. Where covariances depend on the data, so
-    do the weights, and choosing the smallest can overstate: then the inputs are "nominal", and so is the result.
+    do the weights, and the smallest may be too small: then the inputs are "nominal", and so is the result.
 
     Source: Julier and Uhlmann (1997); cubature fusion under amplify-and-forward relays, equations (8) and (34).
     """
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """At most "upper"."""
+        """Lower the weakest claim to "upper" at most."""
         return _of_covariances(claims, "upper")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -114,7 +122,7 @@ class EqualIntersection(AbstractFusion):
     """
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """At most "upper"."""
+        """Lower the weakest claim to "upper" at most."""
         return _of_covariances(claims, "upper")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -124,24 +132,28 @@ class EqualIntersection(AbstractFusion):
 
 
 class FixedIntersection(AbstractFusion):
-    """Covariance intersection with weights given once and for all.
+    """Covariance intersection with fixed weights.
+
+    Args:
+        weights: on the simplex (count,).
 
     Raises:
         ValueError: weights off the simplex.
+
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
 
     weights: Float[Array, "count"]
 
-    def __init__(self, weights: ArrayLike):
+    def __init__(self, weights: Float[ArrayLike, " count"]):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
-        """As many weights as estimates."""
+        """Raise ValueError unless there are as many weights as estimates."""
         array("fusion weights", self.weights, (count,))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """At most "upper"."""
+        """Lower the weakest claim to "upper" at most."""
         return _of_covariances(claims, "upper")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -150,27 +162,31 @@ class FixedIntersection(AbstractFusion):
 
 
 class WeightedFusion(AbstractFusion):
-    """The weighted mean sum_i c_i x_i, with weights on the simplex given once and for all.
+    """Weighted mean sum_i c_i x_i, with fixed weights on the simplex.
 
     The error is sum_i c_i e_i, so E[e e'] <= sum_i c_i E[e_i e_i'] for any correlation (convexity): the bound is
     sum_i c_i P_i. It needs no covariance, so it fuses estimates that claim none.
 
+    Args:
+        weights: c_i on the simplex (count,).
+
     Raises:
         ValueError: weights off the simplex.
+
     Source: H-infinity quantized fusion over amplify-and-forward relays, equation (15).
     """
 
     weights: Float[Array, "count"]
 
-    def __init__(self, weights: ArrayLike):
+    def __init__(self, weights: Float[ArrayLike, " count"]):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
-        """As many weights as estimates."""
+        """Raise ValueError unless there are as many weights as estimates."""
         array("fusion weights", self.weights, (count,))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """At most "upper"."""
+        """Lower the weakest claim to "upper" at most."""
         return weakest([*claims, "upper"])
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -189,7 +205,7 @@ class InverseCovarianceIntersection(AbstractFusion):
     """
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """ "nominal": the assumed form of the correlation is not checked."""
+        """Lower a claim to "nominal": the assumed form of the correlation is not checked."""
         return _of_covariances(claims, "nominal")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -206,7 +222,7 @@ def _intersection(means: Means, covariances: Covariances, information: Covarianc
 
 
 def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
-    """The weakest claim, for rules that weigh by covariances."""
+    """Weakest claim, for rules whose weights come from covariances."""
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
     return weakest([*claims, strongest])
@@ -214,12 +230,16 @@ def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
 
 @readable
 class Fusion(Module):
-    """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which uplinks.
+    """Fusion in a network: of one filter's estimates at every node that has it, by a rule, through uplinks.
 
-    `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each
-    node by its name, all of one kind. The local covariance is widened by the quantizer's error. Covariances are taken
-    to arrive as they are: most are computed before any data. `uplink`: how what comes out of it travels, for rules that
-    hear reports (`AllReports`); one for all nodes, or one for each node by its name.
+    Args:
+        filter: name of the filter whose estimates are fused.
+        rule: the fusion rule.
+        quantizer: of each node's mean on its way to the fusion centre; one for all nodes, or one for each node by its
+            name, all of one kind; None by default. The local covariance is widened by the quantizer's error.
+            Covariances are assumed to arrive as they are: most are computed before any data.
+        uplink: the link of the quantized mean, for rules that use reports (`AllReports`); one for all nodes, or one for
+            each node by its name; None by default.
     """
 
     filter: str = eqx.field(static=True)
@@ -249,7 +269,7 @@ class Fusion(Module):
 
     @property
     def by_report(self) -> bool:
-        """Whether the centre hears reports that may not be what was sent."""
+        """True where the reports that arrive may differ from those that were sent."""
         return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
 
     def _check_reports(self, nodes: Sequence[str], n: int) -> None:
@@ -265,17 +285,17 @@ class Fusion(Module):
             item.error(n)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
-        """How the reports of these nodes travel."""
+        """Report links of these nodes."""
         if self.uplink is None:
             return [ReportLink()] * len(nodes)
         return [self.uplink[n] if isinstance(self.uplink, Mapping) else self.uplink for n in nodes]
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
-        """The quantizers of these nodes' reports, which do not vary over time; none where there are none."""
+        """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
         return [item for item in self._quantizers(nodes) if isinstance(item, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
-        """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
+        """Quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
 
         Raises:
             ValueError: quantizers of different kinds.
@@ -283,7 +303,7 @@ class Fusion(Module):
         return None if self.quantizer is None else stack(self._quantizers(nodes))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """What the fused covariance claims, from what the filters claim."""
+        """Claim of the fused covariance, from the claims of the filters."""
         if self.quantizer is None:
             return self.rule.claim(claims)
         item = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer

@@ -1,4 +1,4 @@
-"""Intersection where part of the correlation is known: split into a part that is and one that is not."""
+"""Split covariance intersection: errors with a part of known and a part of unknown correlation."""
 
 import jax
 import jax.numpy as jnp
@@ -18,22 +18,27 @@ LEAST = 1e-12  # share of an estimate that is hardly used
 class SplitIntersection(AbstractFusion):
     """Fuse errors e_i = a_i + b_i, a and b uncorrelated, the a_i jointly known, of the b_i nothing but each covariance.
 
-    For every w on the simplex P(w) = P^a + blockdiag(P^b_i / w_i) is above the joint covariance, whatever the b_i have
-    in common: weights are the best for it, shares w_i those with the smallest trace. With nothing known it is
-    covariance intersection, with everything known matrix weights. P^b_i is what an estimate's covariance has beyond
+    For every w on the simplex P(w) = P^a + blockdiag(P^b_i / w_i) bounds the joint covariance, whatever the correlation
+    of the b_i: weights are the best for it, shares w_i those with the smallest trace. With nothing known it is
+    covariance intersection, with everything known matrix weights. P^b_i is the excess of an estimate's covariance over
     P^a_ii; where that is not positive semidefinite the result is NaN.
 
-    `known`: P^a, (node, n, node, n), or (node, n, n) for parts that are independent. Claim: at most "upper".
+    Args:
+        known: P^a (node, n, node, n), or (node, n, n) for parts that are independent.
+
+    Claim: at most "upper".
 
     Raises:
         ValueError: a known part that is no joint covariance, or not of as many estimates as are fused.
+
     Source: Julier and Uhlmann, General decentralized data fusion with covariance intersection (2001), split form.
     """
 
     known: Float[Array, "node n node n"]
 
-    def __init__(self, known: ArrayLike):
+    def __init__(self, known: Float[ArrayLike, "node n *joint"]):
         values = array("known part", known, (None,) * rank("known part", known))
+        # Independent parts: the blocks of a block-diagonal P^a.
         if values.ndim == 3 and values.shape[1] == values.shape[2]:
             nodes, n, _ = values.shape
             items = np.arange(nodes)
@@ -42,6 +47,7 @@ class SplitIntersection(AbstractFusion):
             values = joint
         if values.ndim != 4 or values.shape[:2] != values.shape[2:]:
             raise fail("known part", "shape (nodes, n, nodes, n) or (nodes, n, n)", f"shape {values.shape}")
+        # P^a is symmetric and positive semidefinite, to rounding.
         flat = values.reshape(values.shape[0] * values.shape[1], -1)
         scale = np.abs(flat).max(initial=0.0)
         if not np.allclose(flat, flat.T, rtol=0, atol=DEFINITENESS_TOLERANCE * scale) or (
@@ -51,23 +57,24 @@ class SplitIntersection(AbstractFusion):
         self.known = values
 
     def check(self, count: int) -> None:
-        """As many parts as estimates."""
+        """Raise ValueError unless there are as many known parts as estimates."""
         if len(self.known) != count:
             raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """At most "upper"."""
+        """Lower the weakest claim to "upper" at most."""
         if "none" in claims:
             raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
         return weakest([*claims, "upper"])
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Weights for shares, then shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""
+        """Alternate weights for shares and shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""
         known = jnp.asarray(self.known)
         count = len(means)
         items = jnp.arange(count)
         unknown = covariances - known[items, :, items, :]
 
+        # P(w), and shares in proportion to root(tr W_i P^b_i W_i').
         def above(shares: jax.Array) -> jax.Array:
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
@@ -77,9 +84,11 @@ class SplitIntersection(AbstractFusion):
             total = root.sum()
             return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
 
+        # Alternating minimisation from equal shares.
         shares = jax.lax.fori_loop(0, ROUNDS, better, jnp.full(count, 1 / count))
         joint = above(shares / shares.sum())
         weights = matrix_weights(joint)
+        # W x and W P(w) W'; NaN if some P^b_i is no covariance.
         sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
         mean, covariance = jnp.einsum("aib,ib->a", weights, means), weighted(weights, joint)
         return mean, jnp.where(sound, covariance, jnp.nan)

@@ -1,4 +1,4 @@
-"""The quantizer of equal segments, which saturates beyond them."""
+"""Uniform quantizer of equal segments, which saturates beyond them."""
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,15 @@ class UniformQuantizer(AbstractQuantizer):
     |error| <= scale amplitude / levels where x / u lies within the amplitude; outside nothing is guaranteed. Errors and
     their bounds do not depend on the data, so what was "upper" stays so.
 
+    Args:
+        levels: number of segments, at least 2.
+        amplitude: positive, a number or (n,).
+        scale: unit u of x, positive, a number or (n,); 1 by default.
+
     Raises:
-        ValueError: fewer than two levels, an amplitude or scale that is not positive, a reach or an error beyond what
-            numbers hold.
+        ValueError: fewer than two levels, an amplitude or scale that is not positive, an amplitude or an error beyond
+            the range of numbers.
+
     Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
     """
 
@@ -27,26 +33,26 @@ class UniformQuantizer(AbstractQuantizer):
     amplitude: Parameter
     scale: Parameter
 
-    def __init__(self, levels: int, amplitude: ArrayLike, scale: ArrayLike = 1.0):
+    def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
         self.levels = levels_of(levels)
         self.amplitude, self.scale = positive("amplitude", amplitude), positive("scale", scale)
         check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
-        """There is none."""
+        """Return the empty state."""
         return ()
 
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
-        """Quantize with the one amplitude."""
+        """Quantize with the fixed amplitude."""
         return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Half of a segment."""
+        """Half of a segment's length."""
         return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
 
     def claim(self, claim: Claim) -> Claim:
-        """At most "upper"."""
+        """Lower a claim to "upper" at most."""
         return weakest([claim, "upper"])
 
 

@@ -1,4 +1,4 @@
-"""Best linear unbiased weights of several estimates whose errors' joint covariance is known, also a singular one."""
+"""Best linear unbiased weights of several estimates with a known joint error covariance, also a singular one."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -20,7 +20,7 @@ Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
 def _of_joint(weights: Weights) -> Weights:
-    """Weights that refuse what is no joint covariance."""
+    """Decorate weights so that they refuse an array that is no joint covariance."""
 
     @wraps(weights)
     def call(joint: Array, *rest: Array) -> Any:
@@ -35,19 +35,21 @@ def _of_joint(weights: Weights) -> Weights:
 @_of_joint
 @compiled
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """W_i with sum_i W_i = I that make W P W' smallest: W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'.
+    """Matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
 
-    P^+ alone is wrong where a combination of the estimates has no error. With U = P + E D E', D > 0, the range of E is
-    in that of U, and U gives the weights of P since W E is given. D is the mean of the estimates' own variances, so
-    units do not matter; one rank rule, on correlations.
+    W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'. P^+ alone is wrong where a combination of the estimates
+    has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
+    given. D is the mean of the estimates' variances, so units do not matter; one rank rule, on correlations.
 
     Source: Rao, Linear Statistical Inference and its Applications (1973), 4i.4, the unified theory of least squares.
     """
     nodes, n = joint.shape[:2]
     joint = jnp.asarray(joint)
+    # D, and P in units of its roots.
     variances = jnp.einsum("iaia->a", joint) / nodes
     unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
     scaled = joint / (unit[:, None, None] * unit)
+    # U = P + E E' in these units.
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
     result = solve_known(total, ones).T  # E' U^+
@@ -59,17 +61,20 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 def factored_weights(
     shared: Float[Array, "node n sources"], local: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
-    """`matrix_weights` of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
+    """Matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
     P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E.
     """
     nodes, n, sources = shared.shape
+    # Whitened by B: L and E.
     factors = jnp.linalg.cholesky(jnp.asarray(local))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
     common, e = white[:, :sources], white[:, sources:]
+    # Matrix inversion lemma, in the number of sources.
     inner = jnp.linalg.cholesky(jnp.eye(sources) + common.T @ common)
     reduced = e - common @ jax.scipy.linalg.cho_solve((inner, True), common.T @ e)
+    # W = (E' P^-1 E)^-1 E' P^-1.
     information = e.T @ reduced
     back = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
                                            transpose_a=True)  # fmt: skip
@@ -81,7 +86,7 @@ def factored_weights(
 @_of_joint
 @compiled
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """The best weights for each component of the state by itself, diagonal W_i."""
+    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n)."""
     nodes, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", jnp.asarray(joint))
     items = jax.vmap(lambda item: matrix_weights(item.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
@@ -91,7 +96,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
 @_of_joint
 @compiled
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """One number for each estimate, W_i = w_i I, that make tr W P W' smallest."""
+    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n)."""
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
     item = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
@@ -99,7 +104,7 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 
 
 def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) -> Float[jax.Array, "N q"]:
-    """U^+ B for a positive semidefinite U, by its correlation matrix; directions that U has not are skipped."""
+    """U^+ B for a positive semidefinite U, by its correlation matrix; directions outside its range are skipped."""
     deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(total), 0.0))
     scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
     values, vectors = eigh(scale[:, None] * total * scale)

@@ -1,4 +1,4 @@
-"""Networks run: simulated, filtered, recorded, and judged by statistics."""
+"""Simulation of networks: Monte Carlo runs, filtered recordings, and statistics of errors against claims."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What a run is given: its key, its inputs, and what was measured."""
+"""Arguments of a run, checked: its key, its inputs, and the measurements."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from heliograph.simulation.network import Network
 
 
 def key_of(key: object) -> jax.Array:
-    """A key from a seed, or as it is given."""
+    """Return the key of a seed, or the key itself."""
     if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
         return key
     if isinstance(key, jax.Array | np.ndarray):
@@ -20,7 +20,7 @@ def key_of(key: object) -> jax.Array:
 
 
 def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
-    """The plant's inputs (horizon, inputs), which a plant without any does not need."""
+    """Return the plant's inputs (horizon, inputs), which a plant without any does not need."""
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
@@ -28,7 +28,10 @@ def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.nd
 
 
 def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
-    """What a node received (steps, received), NaN where nothing arrived; (steps,) of one component is taken too."""
+    """Return a node's measurements (steps, received), NaN where nothing arrived.
+
+    (steps,) is accepted for one component.
+    """
     flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
     shape = (steps,) if flat else (steps, received)
     result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)

@@ -1,4 +1,4 @@
-"""A record as events: what each node heard, of which step it is, and when it was heard."""
+"""Arrivals of a record as events: each received value with its step and its time of arrival."""
 
 import numpy as np
 
@@ -13,20 +13,26 @@ Arrival = tuple[str, int, float, np.ndarray, float]  # node, sequence, time, val
 
 
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
-    """What was heard in one run, (node, sequence, time, values, arrival), in the order of arrival.
+    """List what was received in one run, (node, sequence, time, values, arrival), in the order of arrival.
 
-    Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too: as a
-    constant delay says, or as was told with it. One value that is heard twice has one number, and two channel noises.
-    What was heard before anything was sent, and what was lost, is left out.
+    Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too: by a
+    constant delay, or by its time stamp. A value that is received twice has one number, and two channel noises.
+    Values received before the first was sent, and lost ones, are left out.
+
+    Args:
+        record: the record.
+        network: the network that it is a record of.
+        run: number of the run; 0 by default.
 
     Raises:
-        ValueError: a node whose delays are random and not told, so that nobody knows of which step a value is.
+        ValueError: a node whose delays are random without time stamps, so that a value's step is unknown.
     """
     instance("record", record, Record, "a Record")
     instance("network", network, Network, "a Network")
     if set(record.measurements) - set(network.nodes):
         raise fail("network", f"one with the record's nodes {list(record.measurements)}", list(network.nodes))
     results: list[Arrival] = []
+    # Node by node; a value of step k - delay arrives at step k.
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, 0)]
         values, late = _timed(name, network.nodes[name], values)
@@ -39,7 +45,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 
 
 def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (steps, m), and how late each is (steps,)."""
+    """Values (steps, m), and the delay of each (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
     item = at(channel, 0) if isinstance(channel, OverTime) else channel
     if item is None or not item.past:

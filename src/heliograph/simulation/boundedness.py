@@ -1,4 +1,4 @@
-"""Whether the mean error of a network's best filter stays bounded for all time: certified, impossible, or undecided."""
+"""Boundedness for all time of the mean error covariance of a network's best filter, certified or refuted."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -37,15 +37,16 @@ Verdict = Literal["certified", "impossible", "undecided"]
 
 @readable
 class Boundedness(NamedTuple):
-    """What is known of E P as time goes on, P the error covariance of the filter that hears all nodes, before each z.
+    """Verdict on E P as time goes on, P the prior error covariance of the filter that receives all nodes.
 
-    "certified": bounded, since `radius` < 1, the spectral radius of E[e e'] -> E[e+ e+'] under fixed `gains`
-    {what arrived: K (n, received)} of xhat+ = A xhat + K (z - what is expected), one for each set of losses.
-    "impossible": without bound for every filter that is linear in what arrives, since `growth` >= 1: an eigenvector of
-    the plant grows by that, in the mean of its square over one step, while the links do not show it. "undecided":
-    neither.
-
-    `bound` (n, n): E P is at most this after long; None where it is not certified or no such matrix is at hand.
+    Args:
+        verdict: "certified": bounded, since `radius` < 1. "impossible": unbounded for every filter that is linear in
+            what arrives, since `growth` >= 1. "undecided": neither.
+        reason: the verdict in words.
+        radius: spectral radius of E[e e'] -> E[e+ e+'] under the fixed `gains`.
+        growth: mean square growth over one step of an eigenvector of the plant while the links do not observe it.
+        gains: {what arrived: K (n, received)} of xhat+ = A xhat + K (z - E z), one for each set of losses.
+        bound: (n, n), E P is at most this in the long run; None where it is not certified or no such matrix is known.
     """
 
     verdict: Verdict
@@ -57,7 +58,7 @@ class Boundedness(NamedTuple):
 
 
 class Links(NamedTuple):
-    """All that the receivers hear together: a chain of modes, what each may tell, and the sensors that speak."""
+    """Joint model of all links: a chain of modes, the outcomes of each, and the stacked sensors."""
 
     initial: Float[np.ndarray, "modes"]
     chain: Float[np.ndarray, "modes modes"]
@@ -68,23 +69,26 @@ class Links(NamedTuple):
 
 
 def certify_boundedness(network: Network) -> Boundedness:
-    """Judge E P of the best filter that hears every node and is told what arrived, linear in what did.
+    """Judge E P of the best filter that receives every node of `network`, linear in what arrives, knowing what arrived.
 
     Certified: rho of U_j -> sum_i chain[i, j] (A - K_i C_i) U_i (A - K_i C_i)' is below 1 for some gains, which are
-    searched and then judged as if they were anybody's. Only rows of certain gain are used: a gain that is random and
-    not told makes noise that grows with the state, so an unstable mode seen through such gains alone is impossible.
-    Impossible: rho(chain within the modes that do not show an eigenvector) |eigenvalue|^2 >= 1. Where losses alone are
-    random, and noises Gaussian, that is true of every filter; a filter that is not linear may learn a hidden mode.
+    searched first and then certified independently of the search. Only rows of known gain are used: a gain that is
+    random and unknown makes noise that grows with the state, so an unstable mode observed through such gains alone is
+    impossible.
+    Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
+    are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
 
     Raises:
         ValueError: a plant, sensor or channel that varies or is not linear, relays that filter, too many sets of
             losses.
+
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
     """
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
     links = _links(network, len(a))
+    # Rows of known gain on all of x, or on the modes that do not decay.
     growing = _unstable(a)
     for space in (np.eye(len(a)), growing):
         known = _known_losses(a, q, links, space)
@@ -93,25 +97,29 @@ def certify_boundedness(network: Network) -> Boundedness:
         if radius < BELOW_ONE:
             bound = steady(known.system, gains, known.system.source(gains)).sum(axis=0) if known.exact else None
             return Boundedness("certified", _certified(a, radius), radius, 0.0, known.gains(gains), bound)
+    # Not certified: is there an unstable mode that losses hide?
     unseen = fastest_unseen(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _refused(network, links, growing, known, unseen, radius)
     return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
 
 def _links(network: Network, states: int) -> Links:
-    """All nodes as one: their sensors one above the other, their channels in parallel."""
+    """Join all nodes: sensors stacked, channels in parallel."""
     if network.relays is not None:
         raise fail("boundedness", "nodes that hear the sensors over channels", "relays that filter")
+    # Sensors one above the other.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
     channels = [_constant(node.channel) for node in nodes]
+    # Channels in parallel, as one chain of modes.
     joint = parallel(channels) if len(channels) > 1 else channels[0]
     for memory in memories(joint).values():
         if isinstance(memory, MarkovChain) and np.any(memory.radius > 0):
             raise fail("boundedness", "chains of known transition", "one whose probabilities are uncertain")
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
+    # Modes that can occur.
     happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
     outputs = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
     noise = scipy.linalg.block_diag(*noises)
@@ -126,13 +134,13 @@ def _constant(channel: Channel) -> AbstractRandomAffine:
 
 
 def _unstable(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
-    """An orthonormal basis of the plant's modes that do not decay."""
+    """Orthonormal basis of the plant's modes that do not decay."""
     _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")
     return np.asarray(basis[:, :count])
 
 
 class KnownLosses(NamedTuple):
-    """What a receiver can rely on, for each of the `kinds` of losses."""
+    """Usable measurements of a receiver, for each of the `kinds` of losses."""
 
     system: KnownLossSystem
     kinds: list[tuple[bool, ...]]
@@ -140,29 +148,31 @@ class KnownLosses(NamedTuple):
 
     @property
     def exact(self) -> bool:
-        """Whether that is all it hears."""
+        """True where nothing that arrives is left out."""
         return all(part.exact for part in self.parts)
 
     @property
     def random(self) -> bool:
-        """Whether random gains leave something out."""
+        """True where random gains make something unusable."""
         return any(part.random for part in self.parts)
 
     def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
-        """Gains on what arrives, from those on its certain sums."""
+        """Gains on what arrives, from those on its sums of known gain."""
         return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
-    """Each set of losses as a kind, with the sums of what arrives whose gain on a subspace of x is certain.
+    """Group the outcomes by set of losses, each with the sums of what arrives whose gain on a subspace of x is known.
 
-    Modes that tell the same are one kind: a gain that differs between them is not told.
+    Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
     """
+    # Sets of losses, and the sums of rows with known gain in each.
     kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for outcome in links.outcomes for o in outcome))
     weights = [
         (i, o, kinds.index(tuple(o.arrived.tolist()))) for i, outcome in enumerate(links.outcomes) for o in outcome
     ]
     parts = [_certain([o for _, o, s in weights if s == kind], links, space) for kind in range(len(kinds))]
+    # Chain of (mode, outcome), with its long-run law.
     values = np.array([s for _, _, s in weights])
     mode = np.array([i for i, _, _ in weights])
     probability = np.array([o.probability for _, o, _ in weights])
@@ -174,7 +184,7 @@ def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.nd
 
 
 class Certain(NamedTuple):
-    """Sums of the rows that arrive: `combine` (r, m) of them, which read `rows` x + noise."""
+    """Sums of received rows with known gain: `combine` (r, m) of them, which equal `rows` x + noise."""
 
     combine: Float[np.ndarray, "r m"]
     rows: Float[np.ndarray, "r n"]
@@ -183,7 +193,7 @@ class Certain(NamedTuple):
     random: bool
 
     def noise(self, outcome: Outcome, links: Links) -> Float[np.ndarray, "r r"]:
-        """Covariance of what they read at x = 0, about the kind's mean."""
+        """Covariance of these sums at x = 0, about the mean of their kind."""
         mean, second = second_moments(outcome.map)
         v = np.append(links.sensor_mean, 1.0)
         signal = np.outer(v, v)
@@ -195,17 +205,20 @@ class Certain(NamedTuple):
 
 
 def _certain(alike: Sequence[Outcome], links: Links, space: Float[np.ndarray, "n d"]) -> Certain:
-    """The null space of E[(G - M) C Y Y' C' (G - M)'] over what is told alike, Y the subspace."""
+    """Null space of E[(G - M) C Y Y' C' (G - M)'] over outcomes that look the same, Y the subspace."""
     moments = [second_moments(o.map) for o in alike]
     mean = np.mean([m for m, _ in moments], axis=0)
     arrived = np.flatnonzero(alike[0].arrived)
+    # M C, and C Y Y' C'.
     rows = mean[:, :-1] @ links.sensing
     seen = links.sensing @ space @ (links.sensing @ space).T
+    # Spread of the gain in mean square, as correlations.
     second = np.mean([np.einsum("ijab,ab->ij", t[..., :-1, :-1], seen) for _, t in moments], axis=0)
     about = mean[:, :-1] @ seen @ mean[:, :-1].T
     scale = np.sqrt(np.diag(second)[arrived])
     scale = np.where(scale > 0, scale, 1.0)
     spread = (second - about)[np.ix_(arrived, arrived)] / scale / scale[:, None]
+    # Eigenvalues that are zero: sums of known gain.
     values, vectors = np.linalg.eigh(spread)
     combine = np.zeros((int(np.sum(values <= CERTAIN)), len(mean)))
     combine[:, arrived] = vectors[:, values <= CERTAIN].T / scale
@@ -224,7 +237,7 @@ def _certified(a: Float[np.ndarray, "n n"], radius: float) -> str:
 def _refused(
     network: Network, links: Links, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
 ) -> tuple[Verdict, str]:
-    """Impossible if an unseen eigenvector grows and noise keeps reaching it, else undecided."""
+    """Return "impossible" if an unobserved eigenvector grows and noise keeps exciting it, else "undecided"."""
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
@@ -247,9 +260,9 @@ def _why(links: Links, system: KnownLossSystem, unseen: Unseen) -> str:
 
 
 def _excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: Unseen) -> bool:
-    """Whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
+    """Test whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
 
-    The noise that random gains make grows only where noise reaches all that is unstable.
+    The noise of random gains grows only where noise reaches all that is unstable.
     """
     a, q = channel.system.transition, channel.system.process
     expected = np.concatenate([unseen.vectors, growing], axis=1) if channel.random else unseen.vectors

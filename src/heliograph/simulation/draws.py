@@ -1,11 +1,11 @@
-"""The seed's way to a draw: a key for each run, step, place and purpose, so that no draw depends on the others."""
+"""Random keys by run, step, place and purpose, so that no draw depends on the others."""
 
 from zlib import crc32
 
 import jax
 import numpy as np
 
-# What a key is for: folded in last, so that each use has its own stream.
+# What a key is for: folded in last, so that uses have separate streams.
 INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START, MEMORY, MEMORY_START = range(7)
 WORLD = 0  # the plant's place among the checksums of names
 
@@ -27,5 +27,5 @@ def draw_key(run_key: jax.Array, k: Number, place: Number, purpose: int) -> jax.
 
 
 def checksum(name: str) -> int:
-    """The place of a node, or of a hop "SENDER to LISTENER", among all keys."""
+    """Checksum of the name of a node, or of a hop "SENDER to LISTENER", as its place among all keys."""
     return crc32(name.encode())

@@ -1,4 +1,4 @@
-"""Whether the flags that reach a filter are of the kind that it takes: of this step, or of the step before."""
+"""Check that the flags that reach a filter are of the kind that it uses: of this step, or of the step before."""
 
 from collections.abc import Iterator, Sequence
 
@@ -17,12 +17,13 @@ NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
 
 def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
-    """Refuse channels, one after another, whose flags are not those that a filter takes: it would claim wrongly.
+    """Refuse channels, one after another, whose flags are not those of the filter's model: its claim would be wrong.
 
     Raises:
-        ValueError: a flag of another step; no flag where a filter takes the mode.
+        ValueError: a flag of another step; no flag where a filter uses the mode.
     """
     rows = [part for channel in channels for part in _rows(channel)]
+    # Flags stand after the measurement; each comes from one row of the channels.
     for reader in _readers(item):
         if isinstance(reader, ModeObservedFilter):
             sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
@@ -37,7 +38,7 @@ def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRand
 
 
 def _readers(item: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
-    """Filters that take flags, at the end of the first numbers that arrive; also inside of others."""
+    """Filters that use flags, after the measurement in the received vector; also inside of others."""
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(item, is_leaf=lambda part: isinstance(part, kinds))
     return [
@@ -48,7 +49,7 @@ def _readers(item: AbstractFilter) -> list[SideInformationFilter | ModeObservedF
 
 
 def _rows(channel: AbstractRandomAffine) -> Iterator[AbstractRandomAffine]:
-    """For each output the map that it comes from."""
+    """Yield for each output the map that it comes from."""
     if isinstance(channel, Stack):
         for part in channel.maps:
             yield from _rows(part)

@@ -1,4 +1,4 @@
-"""Steps of all filters without what they find implausible, and what is said of it over a recording."""
+"""Steps of all filters without implausible data, and the messages about them for a recording."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,22 +12,22 @@ from heliograph.simulation.centres.uplinks import Drawn
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
 
-Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and what is found
+Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
 
 
 def implausible(result: Mapping[str, PyTree]) -> jax.Array:
-    """Whether some filter finds what it heard implausible."""
+    """Test whether some filter judges its measurement implausible."""
     items = [jnp.any(item.implausible) for item in (*result["judged"], *result["judged_centrally"].values())]
     return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
 
 
 def any_implausible(result: Mapping[str, PyTree]) -> bool:
-    """The same of what was found before."""
+    """Test the same of stored results."""
     return any((item.reason > 0).any() for item in (*result["judged"], *result["judged_centrally"].values()))
 
 
 def reasons(result: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-    """Why each filter should not use what it heard, by kind and by name."""
+    """Reason of each filter not to use its measurement, by kind and by name."""
     return [item.reason for item in result["judged"]], {
         n: item.reason for n, item in result["judged_centrally"].items()
     }
@@ -42,7 +42,7 @@ def step_without(
     k: jax.Array,
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
-    """The step again, where each filter leaves out what it found implausible in the first."""
+    """Repeat a step, where each filter skips what it judged implausible the first time."""
     after, result = filters.step(states, z, u, k, drawn, reasons(first[1]))
     return after, result | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
@@ -55,7 +55,7 @@ def plausible_step(
     k: jax.Array,
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
-    """One step of all filters that judge, without what is implausible; the second step is taken only where some is."""
+    """Step all filters without implausible data; the second step is taken only where some is."""
     first = filters.step(states, z, u, k, drawn)
     result: Stepped = jax.lax.cond(
         implausible(first[1]), lambda: step_without(filters, first, states, z, u, k, drawn), lambda: first
@@ -64,7 +64,7 @@ def plausible_step(
 
 
 class Judges:
-    """Reads the filters' judgements by node: of a step, or of a recording, whose axis comes first."""
+    """Judgements of the filters by node: of a step, or of a recording, whose axis comes first."""
 
     def __init__(self, network: Network):
         self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
@@ -73,11 +73,11 @@ class Judges:
                 self._places[node].append(place)
 
     def of_node(self, result: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
-        """The judgements of the filters that hear a node; where it has none, of the central ones."""
+        """Judgements of the filters that receive from a node; where it has none, of the central ones."""
         return self._rows(result, self._places[node], not self._places[node])
 
     def of_all(self, result: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """The judgements of all filters."""
+        """Judgements of all filters."""
         places = [(k, f, i) for k, item in enumerate(result["judged"]) for f, i in np.ndindex(*item[0].shape[-2:])]
         return self._rows(result, places, True)
 
@@ -92,7 +92,7 @@ class Judges:
 
 
 def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
-    """By node the rows of a recording that are implausible there, and why."""
+    """Rows of a recording that are implausible, by node, each with its reason."""
     judges, result = Judges(network), dict[str, dict[int, str]]()
     for name in network.names:
         votes = judges.of_node(outcome, name)
@@ -104,9 +104,11 @@ def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, d
 
 
 def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
-    """What is to be said of a recording: rows that are implausible, or to one filter alone, and inputs."""
+    """Messages about a recording: rows that are implausible, or to one filter alone, and inputs."""
+    # Rows that are implausible for all filters of a node.
     lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, item in refused.items()
              for rows, why in [(list(item), next(iter(item.values())))]]  # fmt: skip
+    # Rows that a single filter skips.
     items = {(node, name): [part[:, f, i] for part in result["judged"][kind]]
             for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
     every = {(FUSED, name): list(item) for name, item in result["judged_centrally"].items()}
@@ -117,6 +119,7 @@ def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str,
         if rows:
             why = in_words(reason[rows[0]], distance[rows[0]])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
+    # Inputs, judged by all filters.
     if network.inputs:
         votes = Judges(network).of_all(result)
         rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
@@ -125,7 +128,7 @@ def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str,
 
 
 def _flagged(votes: Float[np.ndarray, "steps filters 4"], part: str) -> list[int]:
-    """Rows in which some filter says so."""
+    """Rows that some filter flags."""
     if not votes.size:
         return []
     results: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(part)] > 0).any(axis=-1)).tolist()

@@ -1,4 +1,4 @@
-"""How likely a filter finds a run of data: the sum of what its corrections say."""
+"""Log-likelihood of recorded data under a filter's model: the sum over its innovations."""
 
 import jax
 import jax.numpy as jnp
@@ -10,20 +10,29 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
 
 
-def log_likelihood(filter: AbstractFilter, measurements: ArrayLike, inputs: ArrayLike | None = None) -> Scalar:
-    """log p(z_1, z_2, ...) as the filter sees it: the sum of its innovations' log-likelihoods, in nats.
+def log_likelihood(
+    filter: AbstractFilter,
+    measurements: Float[ArrayLike, "steps received"],
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
+) -> Scalar:
+    """log p(z_1, z_2, ...) under the filter's model: the sum of its innovations' log-likelihoods, in nats.
 
-    Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere. NaN
-    in the measurements did not arrive and counts nothing. `jax.grad` passes through it, with respect to any array of
-    the filter, in the precision of the trace (`jax.enable_x64`).
+    Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere.
+    `jax.grad` passes through it, with respect to any array of the filter, in the precision of the trace
+    (`jax.enable_x64`).
 
-    Shapes: measurements (steps, received), inputs (steps, inputs).
+    Args:
+        filter: the filter.
+        measurements: rows (steps, received); NaN did not arrive and adds nothing.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
         ValueError: measurements or inputs of the wrong shape, infinite values, more steps than the filter covers.
+
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter")
+    # Shapes of the data, which may be traced.
     z = rows("measurements", measurements, None, filter.received, missing=True)
     steps = len(z)
     if not len(filter.inputs) and inputs is None:
@@ -31,12 +40,13 @@ def log_likelihood(filter: AbstractFilter, measurements: ArrayLike, inputs: Arra
     u = rows("inputs", inputs, steps, len(filter.inputs), missing=False)
     if filter.horizon is not None and steps > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", steps)
+    # One scan; a plain number unless it is traced.
     total = _sum(filter, z, u)
     return total if isinstance(total, jax.core.Tracer) else float(total)
 
 
 def rows(name: str, value: ArrayLike | None, steps: int | None, length: int, missing: bool) -> Float[Array, "steps n"]:
-    """An array of `length` numbers a step; NaN where `missing` is allowed."""
+    """Array of `length` numbers a step; NaN where `missing` is allowed."""
     if isinstance(value, jax.core.Tracer):
         return value
     try:

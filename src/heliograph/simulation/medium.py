@@ -1,4 +1,4 @@
-"""What is between the plant and the filters: each node's own sensor and channel, or relays that talk in slots."""
+"""Transmission from the plant to the filters: each node's sensor and channel, or relays that transmit in slots."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -28,29 +28,29 @@ ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 
 
 class AbstractMedium(Module):
-    """How signals reach the nodes: it holds the states of all channels of a run."""
+    """Transmission of the signals to the nodes, with the states of all channels of a run."""
 
     def init(self, key: jax.Array) -> PyTree:
-        """Before the first step; `key` is the run's."""
+        """Return the state before the first step; `key` is the run's."""
         raise NotImplementedError
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, ObservationModel]:
-        """What reaches the nodes of each group at step k, x the state to which u led; NaN where nothing does."""
+        """Deliver the measurements of the nodes of each group at step k, x the state to which u led; NaN for none."""
         raise NotImplementedError
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
-        """After the filters' step, with their estimates by kind, (filter, node, ...)."""
+        """Feed the filters' estimates back after their step, by kind, (filter, node, ...)."""
         return state
 
 
 class NodeGroup(Module):
-    """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws.
+    """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
-    `teller`: the filters that sensors hear back, whose estimates stand at `place` (kind, filter) among all.
+    `teller`: the filters that are fed back to the sensors, whose estimates stand at `place` (kind, filter) among all.
 
-    Shapes: checksums (node,), memories (node, memories of a channel): checksums of what the channels remember.
+    Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
     """
 
     sensor: AnySensor
@@ -62,19 +62,19 @@ class NodeGroup(Module):
 
 
 class LinkState(NamedTuple):
-    """A channel's state, and the estimate that its sensor heard back last, (n,); None where it hears none."""
+    """State of a channel, and the estimate (n,) last fed back to its sensor; None without feedback."""
 
     memory: PyTree
     feed_back: jax.Array | None
 
 
 class SeparateChannels(AbstractMedium):
-    """Each node has its own sensor and its own channel."""
+    """Nodes with a sensor and a channel each."""
 
     groups: tuple[NodeGroup, ...]
 
     def init(self, key: jax.Array) -> PyTree:
-        """States of the channels and what was heard back, by group, with a leading node axis."""
+        """Return states of the channels and of the feedback, by group, with a leading node axis."""
 
         def single(group: NodeGroup) -> LinkState:
             feed_back = None if group.teller is None else jnp.asarray(group.teller.init().mean)
@@ -85,7 +85,7 @@ class SeparateChannels(AbstractMedium):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, ObservationModel]:
-        """The sensor measures x and takes off what is expected of it, the channel delivers."""
+        """Measure x, subtract the reference of sensors with feedback, and deliver through the channels."""
 
         def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             sensor = at(group.sensor, k)
@@ -100,7 +100,7 @@ class SeparateChannels(AbstractMedium):
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
-        """Every sensor hears what its filter estimates now."""
+        """Feed the present estimate of each filter back to its sensor."""
         return tuple(
             reach if group.place is None else LinkState(reach.memory, estimates[group.place[0]].mean[group.place[1]])
             for group, reach in zip(self.groups, state, strict=True)
@@ -113,20 +113,20 @@ def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
 
 
 class CommonChannel(AbstractMedium):
-    """One sensor and one channel, drawn once a step; each node hears its rows of what arrives."""
+    """Common sensor and channel, drawn once a step; each node receives its rows of the output."""
 
     sensor: AnySensor
     channel: Channel
     rows: tuple[np.ndarray, ...]  # (node, received) of each group
 
     def init(self, key: jax.Array) -> PyTree:
-        """What a late channel holds of the past; the channel forgets all else."""
+        """Return the past signals of a late channel; the channel has no other memory."""
         return start(self.channel, key, checksum(SENDER), ())
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, ObservationModel]:
-        """The sensor measures x, the channel delivers."""
+        """Measure x and deliver through the channel."""
         sensor, place = at(self.sensor, k), checksum(SENDER)
         y = sensed(sensor, x, draw_key(key, k, place, SENSOR))
         state, z = deliver(self.channel, state, y, key, k, place, ())
@@ -134,7 +134,7 @@ class CommonChannel(AbstractMedium):
 
 
 class Relayed(NamedTuple):
-    """What the relays will send, (relay, n), and the states of the hops that remember."""
+    """Estimates that the relays will send, (relay, n), and the states of the hops with memory."""
 
     estimates: jax.Array
     hops: dict[str, PyTree]
@@ -143,16 +143,16 @@ class Relayed(NamedTuple):
 class Slots(AbstractMedium):
     """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
 
-    A hop that remembers moves on at every step, used or not; the same pair in another slot is another hop.
+    A hop with memory moves on at every step, used or not; the same pair in another slot is another hop.
     """
 
     relays: RelayNetwork
     local: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
-    memories: dict[str, np.ndarray]  # places of what each remembering hop's links hold
+    memories: dict[str, np.ndarray]  # places of the memories of each hop that has some
 
     def init(self, key: jax.Array) -> Relayed:
-        """Every relay knows the initial mean."""
+        """Return the initial mean as every relay's estimate, and the hops' initial states."""
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
             name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
@@ -163,11 +163,13 @@ class Slots(AbstractMedium):
     def receive(
         self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[Relayed, ObservationModel]:
-        """The sum of the hops of this step's slot, at each listener."""
+        """Sum the hops of this step's slot, at each listener."""
+        # Signals: of the sensor, and C s of each relay.
         sensor = at(self.relays.sensor, k)
         y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
         signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
+        # Hops without memory by a branch for the slot, then those with memory.
         received = self._forgetful(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
         for name, (number, listener, sender, hop) in _remembering(self.relays).items():
@@ -178,12 +180,13 @@ class Slots(AbstractMedium):
         return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
 
     def feed_back(self, state: Relayed, estimates: Sequence[Estimate]) -> Relayed:
-        """The relays' estimates, to be sent at the next step."""
+        """Store the relays' estimates, to be sent at the next step."""
         means = [estimates[kind].mean[f, i] for kind, f, i in self.local]
         return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
 
     def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
-        """What each listener hears through hops that forget; NaN where nobody transmits to it."""
+        """Sum at each listener through hops without memory; NaN where nobody transmits to it."""
+        # Slots of one structure share a branch; numbers of each slot within it.
         kinds: dict[object, list[int]] = {}
         for number, slot in enumerate(self.relays.slots):
             kinds.setdefault(structure(slot), []).append(number)
@@ -191,6 +194,7 @@ class Slots(AbstractMedium):
         for i, numbers in enumerate(kinds.values()):
             kind[numbers], position[numbers] = i, np.arange(len(numbers))
         branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
+        # The branch of this step's slot.
         now = k % len(kind)
         received: dict[str, jax.Array] = jax.lax.switch(
             jnp.asarray(kind)[now], branches, jnp.asarray(position)[now], k, sent, key
@@ -212,7 +216,7 @@ class Slots(AbstractMedium):
 
 
 def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
-    """Slot, listener, sender and hop of those that remember, by name."""
+    """Slot, listener, sender and hop of the hops with memory, by name."""
     return {
         f"{number} {listener} {sender}": (number, listener, sender, hop)
         for number, slot in enumerate(relays.slots)
@@ -235,7 +239,8 @@ def _receive(
 
 
 def medium_of(network: Network) -> AbstractMedium:
-    """What is between the plant and the nodes of a network."""
+    """Build the transmission from the plant to the nodes of a network."""
+    # Relays in slots.
     if network.relays is not None:
         places = network.places()
         listeners = {name: i for i, name in enumerate(network.relays.filters)}
@@ -245,10 +250,12 @@ def medium_of(network: Network) -> AbstractMedium:
             tuple(tuple(listeners[name] for name in names) for names in network.groups),
             memory_places({name: hop for name, (_, _, _, hop) in _remembering(network.relays).items()}),
         )
+    # One channel for all nodes.
     if network.common is not None:
         rows = network.rows()
         received = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
+    # A sensor and a channel for each node, stacked by group.
     groups, places = [], network.places()
     local = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in local.items()})

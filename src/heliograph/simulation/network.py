@@ -1,4 +1,4 @@
-"""A network: one plant, and nodes that hear something of it, with the filters that listen there."""
+"""Network: one plant, and nodes that receive measurements of it, with their filters."""
 
 from collections.abc import Iterable, Mapping
 from copy import copy
@@ -43,15 +43,20 @@ class Kind(NamedTuple):
 
 @readable
 class Network(Module):
-    """A plant observed by named nodes. Everything downstream (simulation, filters, reports) reads this one description.
-
-    `fused` names what is made of several nodes: a `Fusion` of the estimates that one of their filters gives, or a
-    central filter that receives all measurements, joined in the order of the nodes. In results these stand under the
-    node name "fused".
+    """A plant observed by named nodes: the description that simulation, filters and reports are made from.
 
     `Network.of_relays` makes the network of relays that filter and forward, `Network.sharing` that of nodes which share
-    a sensor's noise, a hop or a shadow. Nodes that share a structure form a group,
-    their filters that share one a kind: each is one array axis from here to the results, where names come back.
+    a sensor's noise, a hop or fading. Nodes of one structure form a group, filters of one structure in it a kind: each
+    is one array axis from here to the results, which have names again.
+
+    Args:
+        plant: the plant.
+        nodes: nodes by name.
+        fused: fusions by name: a `Fusion` of the estimates of one of the nodes' filters, or a central filter that
+            receives all measurements, joined in the order of the nodes. In results they stand under the node name
+            "fused". None by default.
+        relays: network of relays, set by `Network.of_relays`.
+        common: common sensor and channel, set by `Network.sharing`.
 
     Raises:
         ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has.
@@ -82,6 +87,7 @@ class Network(Module):
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
+        # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
             check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
@@ -91,12 +97,14 @@ class Network(Module):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+        # Groups of nodes and kinds of filters, by structure.
         self.groups = _grouped((name, (_world(n), n.filters)) for name, n in self.nodes.items())
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)
             for alike in _grouped(self.nodes[names[0]].filters.items())
         )
+        # Sensors and channels of each group fit, then fusions.
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
@@ -120,11 +128,16 @@ class Network(Module):
     def of_relays(
         relays: RelayNetwork, schedules: Mapping[str, Schedule], receivers: Mapping[str, AbstractFilter]
     ) -> "Network":
-        """Relays that run their schedules in the world, and the receiver with its filters, which all hear the same.
+        """Network of relays that run their schedules in the world, and a receiver with its filters.
 
-        At each step the relays send C s_r, with s_r their estimates at the step before, through hops that are drawn
-        anew; every filter then hears the sum of its hops, NaN where nobody transmits to it by plan. The nodes are the
-        relays, each with the one filter "own", and "receiver". A recording may leave out what a relay heard.
+        At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
+        draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
+        the relays, each with a single filter "own", and "receiver". A recording may leave out what a relay received.
+
+        Args:
+            relays: the relays' slots and hops.
+            schedules: gains of each relay, by name.
+            receivers: the receiver's filters, by name.
 
         Raises:
             ValueError: relays without a schedule, schedules of the wrong shape.
@@ -133,6 +146,7 @@ class Network(Module):
         schedules = table("relay schedules", schedules, "schedules")
         if set(schedules) != set(relays.relays):
             raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
+        # Each relay runs its schedule.
         filters: dict[str, dict[str, AbstractFilter]] = {}
         n = len(relays.states)
         for name, item in zip(relays.relays, relays.received, strict=False):
@@ -143,6 +157,7 @@ class Network(Module):
         filters[RECEIVER] = dict(receivers)
         check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
+        # All places receive sums of hops.
         nodes = {
             name: Listener(filters[name], item, outputs, relays.always_receives(name))
             for name, item in zip(relays.filters, relays.received, strict=True)
@@ -157,16 +172,23 @@ class Network(Module):
         filters: Mapping[str, Mapping[str, AbstractFilter]],
         fused: Mapping[str, Fusion | AbstractFilter] | None = None,
     ) -> "Network":
-        """Nodes that hear parts of one channel: they share what is in it once, a sensor's noise, a hop, a shadow.
+        """Network of nodes that receive parts of one channel: they share its sensor noise, hops and fading.
 
-        `filters` of each node, all of which hear the same number of outputs: the first node the first ones, and so on.
+        Args:
+            plant: the plant.
+            sensor: the common sensor.
+            channel: the common channel, without memory.
+            filters: filters by name of each node, all with the same number of outputs: the first node receives the
+                first ones, and so on.
+            fused: fusions by name; None by default.
 
         Raises:
-            ValueError: filters that do not hear all outputs once, a channel that remembers, parts that do not fit.
+            ValueError: filters that do not use all outputs once, a channel with memory, parts that do not fit.
         """
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
         received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
+        # Each output goes to one node.
         received = {
             name: max((item.received for item in filter_.values()), default=0) for name, filter_ in filters.items()
         }
@@ -181,14 +203,14 @@ class Network(Module):
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
     def rows(self) -> dict[str, np.ndarray]:
-        """Which outputs of the common channel each node hears."""
+        """Outputs of the common channel that each node receives."""
         ends = np.cumsum([self.nodes[name].received for name in self.names])
         return {
             name: np.arange(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)
         }
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
-        """The network of a recording that lacks what some relays heard: without the filters of these.
+        """Return the network of a recording that lacks the measurements of some relays, without their filters.
 
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
@@ -202,7 +224,7 @@ class Network(Module):
         return Network(self.plant, {n: v for n, v in self.nodes.items() if n in known}, relays=self.relays)
 
     def nodes_with(self, name: str) -> list[str]:
-        """Names of the nodes that have the filter `name`, in the given order.
+        """Names of the nodes that have the filter `name`, in the order of the network.
 
         Raises:
             ValueError: none has it.
@@ -214,7 +236,7 @@ class Network(Module):
         return results
 
     def places(self) -> dict[tuple[str, str], tuple[int, int, int]]:
-        """Where the estimate of a node's filter stands, as (kind, filter, node), by node and filter."""
+        """Place of each estimate as (kind, filter, node), by node and filter."""
         return {
             (node, name): (k, f, i)
             for k, kind in enumerate(self.kinds)
@@ -235,14 +257,14 @@ class Network(Module):
         return names
 
     def claims(self) -> Claims:
-        """What every estimate claims, by node and filter; fused ones last, under "fused"."""
+        """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
         claims = {name: {f: item.claim for f, item in node.filters.items()} for name, node in self.nodes.items()}
         if self.fused:
             claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
         return lowered(claims) if self.single else claims
 
     def in_single_precision(self) -> "Network":
-        """The same network computed in single precision: nobody counts the digits lost, so that no claim is proved."""
+        """Return the network for single precision: the lost digits are not bounded, so that all claims are lowered."""
         result = copy(self)
         object.__setattr__(result, "single", True)
         return result
@@ -251,11 +273,13 @@ class Network(Module):
         if isinstance(item, AbstractFilter):
             return item.claim
         names = self.nodes_with(item.filter)
+        # A rule that needs nothing but the estimates.
         if not isinstance(item.rule, AbstractInformedFusion):
             return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
         rule, local = type(item.rule).__name__, {n: self.nodes[n] for n in names}
         if item.quantizer is not None and not item.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
+        # An informed rule: it needs the joint moments of the errors.
         known = self.parts_of(item.filter)
         if len(known) < len(local):
             raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
@@ -268,7 +292,7 @@ class Network(Module):
         return reported_claim(rule, claim, item, {n: node.complete for n, node in local.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
-        """Sensor, channel and the filter `name` of each node that has it and hears a sensor through a channel."""
+        """Sensor, channel and the filter `name` of each node that has it and receives a sensor through a channel."""
         local = {node: self.nodes[node] for node in self.nodes_with(name)}
         worlds = {n: v if isinstance(v, Node) else self.common for n, v in local.items()}
         return {n: (w.sensor, w.channel, local[n].filters[name]) for n, w in worlds.items() if w is not None}
@@ -280,14 +304,14 @@ class Network(Module):
 
 
 def _world(node: Node | Listener) -> object:
-    """What decides how a node hears."""
+    """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
         return node.sensor, anonymous(node.channel), node.informed_by
     return node.received, node.complete
 
 
 def lowered(claims: Claims) -> Claims:
-    """Nominal, whatever is claimed more."""
+    """Lower every claim to "nominal" at most."""
     return {
         node: {name: "none" if claim == "none" else "nominal" for name, claim in element.items()}
         for node, element in claims.items()
@@ -295,7 +319,7 @@ def lowered(claims: Claims) -> Claims:
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Names of what shares a structure, in order of first appearance."""
+    """Group names by the structure of their items, in order of first appearance."""
     results: dict[object, list[str]] = {}
     for name, item in items:
         results.setdefault(structure(item), []).append(name)

@@ -1,4 +1,4 @@
-"""What stands at a place of a network: a sensor, the channel its signal takes, and the filters that listen there."""
+"""Nodes of a network: a sensor, the channel of its signal, and the filters that receive it."""
 
 from collections.abc import Mapping
 
@@ -20,18 +20,23 @@ from heliograph.simulation.flags import check_flags
 
 @readable
 class Node(Module):
-    """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
+    """A sensor, the channel of its signal, and named filters; the true channel need not be that of the filters' models.
 
-    With a `fed_back_filter` among them the sensor sends what that filter does not expect.
+    With a `fed_back_filter` among them the sensor sends the difference from that filter's prediction.
 
-    `limits`: what an honest received number is within, (low, high) for all of them or a pair for each, None where there
-    is no limit. `invalid`: a code, or several, by which the sensor says that it has no value (-999). Recorded and live
-    data beyond that count as not arrived, are counted and named. Claims stand as far as no honest number is among them.
+    Args:
+        sensor: the sensor.
+        channel: the true channel from the sensor to the filters.
+        filters: filters by name.
+        limits: range of an honest received number, (low, high) for all of them or a pair for each, None where there
+            is no limit. Recorded and live data outside count as not arrived, are counted and named. Claims stand as far
+            as no honest number is among them.
+        invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
 
     Raises:
-        ValueError: a sensor and a channel that do not fit; a filter that takes another number of values than arrive,
-            or flags of another step than those that do; a filter that hears beside one that is fed back; limits that
-            are none.
+        ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
+            or flags of another step than those that do; another filter of the measurement next to one that is fed back;
+            limits that are none.
     """
 
     sensor: AnySensor
@@ -48,11 +53,13 @@ class Node(Module):
         invalid: ArrayLike = (),
     ):
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
+        # Sensor, channel and filters fit.
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_sent(first(sensor), first(channel))
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid)
+        # Side information of the right step; feedback to one filter alone.
         for name, item in self.filters.items():
             check_flags(f"filter {name!r}", item, [first(channel)])
         observation = [name for name, item in self.filters.items() if item.received]
@@ -66,30 +73,30 @@ class Node(Module):
 
     @property
     def informed_by(self) -> str | None:
-        """Name of the filter whose estimates the sensor hears back; None where it hears none."""
+        """Name of the filter whose estimates are fed back to the sensor; None without."""
         return next((name for name, item in self.filters.items() if isinstance(item, FedBackFilter)), None)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of what is sent to the node."""
+        """Names of the sensor's outputs."""
         return tuple(first(self.sensor).outputs)
 
     @property
     def received_names(self) -> tuple[str, ...]:
-        """Names of what reaches the filters."""
+        """Names of the components of the measurement."""
         return received_names(self.outputs, self.received)
 
     @property
     def complete(self) -> bool:
-        """Whether everything arrives, always."""
+        """True if everything arrives, always."""
         return not first(self.channel).erases
 
 
 @readable
 class Listener(Module):
-    """A place in a network of relays, which hears one of them or the sensor, and the filters there.
+    """A place in a network of relays, which receives from relays or the sensor, and its filters.
 
-    `received` numbers named after `outputs` are heard, always all of them if it is `complete`.
+    `received` numbers named after `outputs` arrive, always all of them if it is `complete`.
     """
 
     filters: dict[str, AbstractFilter]
@@ -99,42 +106,42 @@ class Listener(Module):
 
     @property
     def received_names(self) -> tuple[str, ...]:
-        """Names of what reaches the filters."""
+        """Names of the components of the measurement."""
         return received_names(self.outputs, self.received)
 
     @property
     def limits(self) -> None:
-        """None: a network of relays has no limits of its own."""
+        """None: a network of relays has no limits."""
 
 
 @readable
 class Common(Module):
-    """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
+    """Common sensor and channel of all nodes: each receives the outputs that follow those of the nodes before it."""
 
     sensor: AnySensor
     channel: Channel
 
 
 def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
-    """Names of what is received: the sensor's outputs where these are as many, else z0, z1, ..."""
+    """Names of the received components: the sensor's outputs where these are as many, else z0, z1, ..."""
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 
 
 def check_received(name: str, item: AbstractFilter, received: int) -> None:
-    """A filter that hears as much as arrives, or does not listen."""
-    if item.received not in (0, received):  # 0: it does not listen
+    """Refuse a filter of another number of components than arrive, unless it uses no measurements."""
+    if item.received not in (0, received):  # 0: it uses no measurements
         raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
 
 
 def check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-    """A filter of as many states and inputs as the plant has."""
+    """Refuse a filter of other numbers of states and inputs than the plant has."""
     for what, single, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
         if len(single) != len(theirs):
             raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
-    """Filters that hear what arrives at their node."""
+    """Refuse filters that do not fit the measurement of their node."""
     for name, item in filters.items():
         check_type(f"filter {name!r}", item, AbstractFilter)
         if isinstance(item, AbstractFilter):
@@ -142,6 +149,6 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 
 
 def check_type(name: str, value: object, expected: type) -> None:
-    """An object of a class, named in one line if it is none."""
+    """Refuse an object of another class, in one line."""
     if not isinstance(value, expected):
         raise fail(name, f"a {expected.__name__}", shown(value))

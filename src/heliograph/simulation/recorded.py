@@ -1,4 +1,4 @@
-"""Every filter of a network over recorded measurements."""
+"""Recordings: every filter of a network over recorded measurements."""
 
 import warnings
 from collections.abc import Mapping
@@ -30,23 +30,29 @@ Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what 
 def run(
     network: Network,
     measurements: Mapping[str, ArrayLike],
-    inputs: ArrayLike | None = None,
-    time: ArrayLike | None = None,
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
+    time: Float[ArrayLike, " steps"] | None = None,
     smooth: AbstractSmoothing | None = None,
     reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
 ) -> Record:
     """Run every filter of the network over recorded measurements.
 
-    measurements: for each node an array (steps, received), NaN where a component did not arrive; what relays heard may
-    be left out, and with it their own filters. inputs: (steps,
-    inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given. smooth: as of
-    `monte_carlo`.
-    reports: of each fusion by `AllReports` and each of its nodes what became of the report that was sent at each step,
-    (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be left out where
-    nothing happens to them by chance.
+    Values beyond a node's limits, and those that are implausible for all filters of a node
+    (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
 
-    Values beyond a node's limits, and what is implausible for all filters of a node (`heliograph.filters
-    .plausibility`), count as not arrived; each is warned of, with its rows from 1.
+    Args:
+        network: the network.
+        measurements: for each node an array (steps, received), NaN where a component did not arrive. Those of relays
+            may be left out, and with them their filters.
+        inputs: (steps, inputs), the input that led to each row; by default a plant without inputs is assumed.
+        time: (steps,), stored in the record; 0, 1, ... by default.
+        smooth: smoothing as in `monte_carlo`; None by default.
+        reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
+            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be
+            left out where the uplinks are deterministic.
+
+    Returns:
+        The record, without truth.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
@@ -58,12 +64,15 @@ def run(
     steps = len(np.asarray(next(iter(measurements.values()))))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
+    # Measurements, inputs and times of one length.
     z = {name: measurement_of(name, measurements[name], steps, node.received) for name, node in network.nodes.items()}
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
+    # Values beyond a node's limits did not arrive.
     for name in network.names:
         z[name] = _within(name, network.nodes[name], z[name])
+    # Filters, and what became of the reports.
     part = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
@@ -77,7 +86,7 @@ def run(
 
 
 def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
-    """Measurements without what is beyond their node's limits, which is warned of."""
+    """Measurements without those beyond their node's limits, which are warned of."""
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z
     row, count = int(np.argmax(outside.any(axis=1))), int(outside.sum())
@@ -89,19 +98,21 @@ def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -
 
 
 def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
-    """What the filters find without what is implausible, which is warned of.
+    """Results of the filters without implausible data, which are warned of.
 
-    Where some is, the recording is filtered step by step without it to find all rows; then, without those that all
-    filters of a node refuse, once again as a recording that never had them.
+    If there are any, the recording is first filtered step by step without them to find all rows; then, without those
+    that all filters of a node refuse, once again as a recording that never had them.
     """
 
     def grouped() -> tuple[np.ndarray, ...]:
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
+    # Usually nothing is implausible.
     result = _filtered(*rest, grouped(), False)
     if not any_implausible(result):
         said = doubts(network, result, {})
     else:
+        # Find all rows that are, then filter again without them.
         result = _filtered(*rest, grouped(), True)
         refused = refused_rows(network, result)
         said = doubts(network, result, refused)
@@ -116,7 +127,7 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 
 def _filtered(*arguments: PyTree) -> PyTree:
-    """Results of `_run_filters` as NumPy arrays, by native code where that takes the filters."""
+    """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
     choice = chosen(_run_filters, arguments, [False] * len(arguments))
     if choice.code is None:
         return to_numpy(_by_xla(*arguments))
@@ -127,7 +138,7 @@ def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     without: bool,
 ) -> PyTree:  # fmt: skip
-    """A scan over all rows; `without` what is implausible."""
+    """Scan over all rows; `without` implausible data."""
 
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row

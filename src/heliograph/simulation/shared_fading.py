@@ -1,4 +1,4 @@
-"""Channels in a run: their draws, and those of the memories that several of them may share."""
+"""Channels in a run: their draws, and those of memories that several of them may share."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -26,7 +26,7 @@ Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a 
 
 
 def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
-    """The places of each channel's memories among all keys: by their names, or by the first channel that holds them.
+    """Places of each channel's memories among all keys: by their names, or by the first channel that has them.
 
     Raises:
         ValueError: one name for memories that differ.
@@ -41,14 +41,14 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
 
 
 class Late(NamedTuple):
-    """A late channel's own state, and what was sent before, the last first."""
+    """State of a late channel, and the signals sent before, the last first."""
 
     channel: PyTree
     line: jax.Array
 
 
 def start(channel: Channel, key: jax.Array, place: Number, shared: Places) -> PyTree:
-    """A channel's state before the first step."""
+    """Return a channel's state before the first step."""
     now, local = at(channel, 0), draw_key(key, 0, place, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
     state = begin(now, local, keys) if len(shared) else now.init(local)
@@ -58,7 +58,7 @@ def start(channel: Channel, key: jax.Array, place: Number, shared: Places) -> Py
 def deliver(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number, shared: Places
 ) -> tuple[PyTree, jax.Array]:
-    """The state that follows, and what the channel makes of y at step k; a late one also of what was sent before."""
+    """Draw the channel at step k and apply it to y, a late one to past signals too: next state and output."""
     now, local = at(channel, k), draw_key(key, k, place, CHANNEL)
     if now.past:
         line = jnp.concatenate([y, state.line])

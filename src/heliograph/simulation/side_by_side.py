@@ -1,4 +1,4 @@
-"""Filters of one kind run side by side: stacked along axes of filters and nodes, and vmapped."""
+"""Filters of one kind in parallel: stacked along axes of filters and nodes, and vmapped."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from heliograph.numerics.module import Module
 
 
 class StepOutput(NamedTuple):
-    """What a filter tells of a step: its estimate, and what it retains of the step or says of the data, if asked."""
+    """Output of a filter's step: its estimate, and its smoother step and judgement if asked for."""
 
     estimate: Estimate
     steps: AbstractSmootherStep | None = None
@@ -33,12 +33,13 @@ def filter_step(
     judges: bool = False,
     skip: jax.Array | None = None,
 ) -> tuple[PyTree, StepOutput]:
-    """One step of a filter, and what is told of it.
+    """Step a filter, and return its output.
 
-    `skip`: the reason not to use z, where there is one: then nothing of it arrived, and where the prediction itself is
-    no number the state before it stays.
+    `skip`: the reason not to use z, if any: then nothing of it arrived, and where the prediction itself is no number
+    the state before it stays.
     """
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
+    # With a smoother step, a judgement, or neither.
     if smooths:
         judgement = item.step_judged(state, z, u, k)[2] if judges else None
         after, steps = item.step_with_smoother(state, z, u, k)
@@ -56,8 +57,8 @@ def filter_step(
 class Alike(Module):
     """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
 
-    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `smooths`: each step tells what
-    a sweep back over it needs.
+    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `smooths`: each step returns its
+    smoother step.
     """
 
     filters: AbstractFilter
@@ -68,13 +69,13 @@ class Alike(Module):
     judges: bool = eqx.field(static=True, default=False)
 
     def init(self) -> PyTree:
-        """States before the first step, (filter and node, ...)."""
+        """Return states before the first step, (filter and node, ...)."""
         return over_all(started, self.count * self.nodes)(self.filters)
 
     def step(
         self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
     ) -> tuple[PyTree, StepOutput]:
-        """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...).
+        """Step each filter with the nodes' measurements (node, received); outputs (filter, node, ...).
 
         `skip` (filter, node): reasons not to use them.
         """
@@ -92,7 +93,7 @@ class Alike(Module):
     def matrices(
         self, read: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
     ) -> PyTree:
-        """What `read` gives of this step of filter f at each node, from the states before it; (node, ...)."""
+        """Apply `read` to this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
         items = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
@@ -105,6 +106,6 @@ def started(item: AbstractFilter) -> PyTree:
 
 
 def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
-    """A function of one of what is stacked, for all of them; some hold no array that would tell how many."""
+    """Vectorise a function of one of what is stacked; some hold no array from which the number could be read."""
     over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
     return over

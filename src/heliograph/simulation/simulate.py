@@ -78,20 +78,27 @@ def monte_carlo(
 ) -> Record | Result:
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
-    `key` is a seed or a JAX key; a run's draws depend on the key, the run, the step and the node's name alone, so
-    neither the chunk size nor another node changes a bit of them. `keep` says what is kept: `Trajectories()` (all,
-    the default) or `Statistics()` (bounded memory). `inputs` (horizon, inputs) are common to all runs.
-    `progress(done, total)` is called after each chunk of runs. The runs are first_run, first_run + 1, ...: a part of a
-    larger simulation, bit for bit; it starts at a multiple of 32, since so many are simulated side by side.
+    A run's draws depend on the key, the run, the step and the node's name alone, so neither the chunk size nor another
+    node changes a bit of them. All cores are used, and all devices where JAX sees others than a processor.
 
-    All cores are used, and all devices where JAX sees others than a processor. `precision` "float32" simulates and
-    filters in single precision, with other draws; what is kept is summed in double precision either way, and what is
-    claimed is "nominal", since the digits that are lost are not counted.
+    Args:
+        network: the network.
+        horizon: number of steps.
+        runs: number of runs.
+        key: a seed or a JAX key.
+        keep: what is collected: `Trajectories()` (all, the default) or `Statistics()` (bounded memory).
+        inputs: (horizon, inputs), common to all runs; by default a plant without inputs is assumed.
+        chunk: number of runs between calls of `progress`; 2048 by default.
+        progress: `progress(done, total)` is called after each chunk of runs; None by default.
+        first_run: number of the first run, a multiple of 32; 0 by default. The runs are first_run, first_run + 1, ...:
+            a part of a larger simulation, bit for bit.
+        precision: "float64" by default. "float32" simulates and filters in single precision, with other draws; sums are
+            in double precision either way, and claims are "nominal", since the digits that are lost are not counted.
+        smooth: smoothing such as `hg.smoothing.FixedInterval()`, whose results stand in the result's `smoothed`; None
+            by default. Warns of filters that are not consistent by their NIS.
 
-    `smooth`, such as `hg.smoothing.FixedInterval()`, estimates earlier states from later data too; what is kept of
-    these estimates stands in the result's `smoothed`. Warns of filters that their own innovations contradict.
-
-    Returns a `Record` for trajectories, else what the reducer makes.
+    Returns:
+        A `Record` for trajectories, else the reducer's result.
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
@@ -99,6 +106,7 @@ def monte_carlo(
     """
     check_process()
     instance("network", network, Network, "a Network")
+    # Counts, inputs and key.
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
     if check_count("first_run", first_run, 0) % BLOCK:
@@ -112,11 +120,13 @@ def monte_carlo(
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
+    # Native code, where it supports network and reducer.
     if not single and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
         made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
         if made is not None:
             return made
+    # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
     both: WithSmoothed[PyTree] = WithSmoothed(reducer)
@@ -132,7 +142,7 @@ def monte_carlo(
 
 
 class _Job(Module):
-    """What is simulated and smoothed, up to which run, what is kept of it, and whether in single precision."""
+    """World, smoother, inputs and key of a simulation, its last run, its reducer, and whether in single precision."""
 
     world: World
     later: Smoother | None
@@ -144,7 +154,7 @@ class _Job(Module):
 
 
 def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:
-    """What the reducer holds after all runs, and what it collected of them, chunk by chunk."""
+    """Carry of the reducer after all runs, and what it collected of them, chunk by chunk."""
     parts = []
     with jax.enable_x64(True):
         lanes = Lanes(
@@ -164,7 +174,7 @@ def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progre
 
 @quickly_compiled
 def _initial(job: _Job) -> PyTree:
-    """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
+    """Carry of the reducer before the first block; compiled, so that shapes are worked out once a network."""
     return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
 
 
@@ -174,7 +184,7 @@ def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
+    """Reduce blocks one after another, of fixed width and order of sums: so chunks do not change a bit."""
 
     def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
         return job.reducer.reduce(carry, _block(job, runs), runs, runs < job.stop)
@@ -184,13 +194,13 @@ def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
 
 @quickly_compiled
 def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
-    """Every lane's blocks, with a leading axis for the lanes."""
+    """Reduce every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
     return result
 
 
 def _block(job: _Job, runs: jax.Array) -> PyTree:
-    """Trajectories (run, time, ...) of one block of runs; (1, time, ...) of what all runs share."""
+    """Trajectories (run, time, ...) of one block of runs; (1, time, ...) for what all runs share."""
     if not job.single:
         return _trajectories(job.world, job.later, job.inputs, job.key, runs)
     with jax.enable_x64(False):

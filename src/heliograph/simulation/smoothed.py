@@ -1,4 +1,4 @@
-"""A network's estimates given later data too, from what its filters retained of each step."""
+"""Smoothed estimates of a network, from the smoother steps of its filters."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -30,7 +30,7 @@ from heliograph.smoothing.modes import AbstractSmoothing
 
 
 class Smoother(Module):
-    """What of a network's filters is smoothed, and how: `kinds` of them and `groups` of measurements, by their places.
+    """Smoothing of a network's filters: `kinds` of them and `groups` of measurements, by their places.
 
     `fusions`: of smoothed estimates at the same time.
     """
@@ -41,14 +41,16 @@ class Smoother(Module):
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def both(self, result: PyTree) -> PyTree:
-        """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
+        """Results of runs (run, time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
         steps_ = [result["smoother_steps"][k] for k in self.kinds]
         filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "central_steps")}
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
+        # Smoothed estimates of nodes and central filters, then their fusions.
         estimates = tuple(self._estimates(steps, 2) for steps in steps_)
         fused = {name: self._estimates(steps, 0) for name, steps in result["central_steps"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
+        # As a block of the steps that are smoothed.
         length = jax.tree.leaves((estimates, fused))[0].shape[1]
         smoothed = {
             "measurements": tuple(result["measurements"][g][:, -length:] for g in self.groups),
@@ -60,6 +62,7 @@ class Smoother(Module):
         if "truth" in result:
             truth = self.smoothing.about(result["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_])}
+        # Sums of the NIS, for the test of consistency.
         nis = tuple(each_run(surprised, steps) for steps in steps_)
         centrally = {name: each_run(nis_sums, steps) for name, steps in result["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
@@ -77,7 +80,7 @@ class Smoother(Module):
         return {"estimates": estimates, "fused": {name: near(item, every) for name, item in known["fused"].items()}}
 
     def _estimates(self, steps: AbstractSmootherStep, axes: int) -> Estimate:
-        """Of runs (run, time, ...), with so many axes after time; where runs share all matrices, covariances once."""
+        """Smoothed estimates of runs (run, time, ...), with so many axes after time; common covariances once."""
 
         def over(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree], PyTree]:
             for _ in range(axes):
@@ -92,13 +95,13 @@ class Smoother(Module):
 
 
 def _combined(item: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Fusions at each time of estimates (time, filter, node, ...)."""
+    """Fuse estimates (time, filter, node, ...) at each time."""
     result: dict[str, Estimate] = jax.vmap(lambda parts: item.step((), parts, jnp.asarray(0))[1])(estimates)
     return result
 
 
 class Part(NamedTuple):
-    """The part of a network that is smoothed: places of its kinds and groups among the network's, and the claims."""
+    """Smoothed part of a network: places of its kinds and groups among the network's, and the claims."""
 
     network: Network
     smoothing: AbstractSmoothing
@@ -107,21 +110,23 @@ class Part(NamedTuple):
     claims: Claims
 
     def smoother(self, filters: AllFilters) -> Smoother:
-        """For these filters of the whole network."""
+        """Build the smoother for these filters of the whole network."""
         return Smoother(self.smoothing, filters.fusions, self.kinds, self.groups)
 
 
 def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> Part:
-    """What of a network is smoothed: all its estimates; where relays run schedules, the receiver's.
+    """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
     Raises:
         ValueError: a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
     """
     instance("smooth", smoothing, AbstractSmoothing, "one such as hg.smoothing.FixedInterval()")
     smoothing.check(horizon)
+    # Relays send filtered estimates: the receiver alone is smoothed.
     part = network
     if network.relays is not None:
         part = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
+    # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
         name: {f: _smoothed_claim(item) for f, item in node.filters.items()} for name, node in part.nodes.items()
     }
@@ -153,7 +158,7 @@ def _fused_claim(network: Network, name: str, item: Fusion | AbstractFilter, cla
 
 
 def _warn_of_nis(network: Network, nis: PyTree) -> None:
-    """Warn of filters whose innovations are larger than they believe, from sums over blocks and runs."""
+    """Warn of filters that are not consistent, from sums of the NIS over blocks and runs."""
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
             for i, node in enumerate(network.groups[group]):
@@ -163,12 +168,12 @@ def _warn_of_nis(network: Network, nis: PyTree) -> None:
 
 
 def one_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
-    """A function of runs (run, ...) for one without an axis of runs."""
+    """Apply a function of runs (run, ...) to one without an axis of runs."""
     return jax.tree.map(lambda leaf: leaf[0], function(jax.tree.map(lambda leaf: leaf[None], values)))
 
 
 def found_record(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
-    """The record of a recording, with what was smoothed beside it."""
+    """Record of a recording, with its smoothed part."""
     if part is None:
         return trajectories_record(network, {"truth": None, **result}, time)
     _warn_of_nis(part.network, result["nis"])
@@ -179,20 +184,20 @@ def found_record(network: Network, part: Part | None, result: PyTree, time: np.n
 
 
 class WithSmoothed(AbstractReducer[Result]):
-    """What is kept of filtered estimates, the same of smoothed ones, and sums of surprise.
+    """Reduction of filtered estimates, of smoothed ones, and sums of the NIS.
 
-    A block is {"filtered", "smoothed", "nis"}; the first two are such as the reducer takes.
+    A block is {"filtered", "smoothed", "nis"}; the first two are such as the reducer expects.
     """
 
     reducer: AbstractReducer[Result]
 
     def initial(self, shapes: PyTree) -> PyTree:
-        """Both carries, and no surprise."""
+        """Return both carries, and zero sums of the NIS."""
         nis = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["nis"])
         return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), nis
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Both."""
+        """Reduce both, and add the NIS of valid runs."""
         filtered, smoothed, nis = carry
         filtered, recorded = self.reducer.reduce(filtered, batch["filtered"], runs, valid)
         smoothed, kept_later = self.reducer.reduce(smoothed, batch["smoothed"], runs, valid)
@@ -205,7 +210,7 @@ class WithSmoothed(AbstractReducer[Result]):
         return (filtered, smoothed, nis), (recorded, kept_later)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
-        """Both, of pairs; and surprise."""
+        """Return both carries, from sums that are pairs; and the NIS."""
         filtered, smoothed = (
             self.reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count)
             for i in (0, 1)
@@ -216,11 +221,11 @@ class WithSmoothed(AbstractReducer[Result]):
         return filtered, smoothed, nis
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
-        """The filtered one alone; `finished` makes both."""
+        """Make the result of filtered estimates alone; `finished` makes both."""
         return self.reducer.finish(carry[0], collected[0], network)
 
     def finished(self, carry: PyTree, collected: PyTree, network: Network, part: Part) -> Result:
-        """The result of the network with that of its smoothed part beside it; warns of filters not worth smoothing."""
+        """Make the result of the network with that of its smoothed part; warn of filters that are not consistent."""
         _warn_of_nis(part.network, carry[2])
         smoothed = self.reducer.finish(carry[1], collected[1], part.network)
         return self.reducer.others(self.finish(carry, collected, network), smoothed, part.claims)

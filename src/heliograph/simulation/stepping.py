@@ -1,4 +1,4 @@
-"""One step of a whole network's filters, under the scan over time; computed before where nothing depends on data."""
+"""One step of a whole network's filters, under the scan over time; precomputed where nothing depends on data."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -37,10 +37,10 @@ from heliograph.smoothing.sweep import planned_with_past
 
 
 class AllFilters(Module):
-    """Every filter of a network: those of the nodes by kind, fusion rules, centres that know more, central filters.
+    """Every filter of a network: those of the nodes by kind, fusion rules, informed centres, central filters.
 
-    `order` brings the groups' measurements, joined, into the order of the nodes. `smooths`: central filters tell what a
-    sweep back needs, and those of the kinds that do.
+    `order` brings the groups' measurements, joined, into the order of the nodes. `smooths`: central filters return
+    smoother steps, as do those of the kinds that do.
     """
 
     alike: tuple[Alike, ...]
@@ -55,11 +55,13 @@ class AllFilters(Module):
     judges: bool = eqx.field(static=True)
 
     def __init__(self, network: Network, smoothed_groups: Collection[int] | None = None, judges: bool = False):
-        """`retaining`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
+        """Stack the filters of a network by structure.
 
-        `judges`: filters say what is implausible, and leave it out where they are told so; none of them retains.
+        `smoothed_groups`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
+        `judges`: filters judge their data, and skip implausible data on request.
         """
         self.smooths, self.judges = smoothed_groups is not None, judges
+        # Filters of the nodes, by kind.
         self.alike = tuple(
             Alike(
                 stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
@@ -71,9 +73,11 @@ class AllFilters(Module):
             )
             for kind, (g, names) in enumerate(network.kinds)
         )
+        # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
         self.reporting = _reporting(network)
+        # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
         entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
@@ -82,7 +86,7 @@ class AllFilters(Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """States before the first step: of nodes' filters, central filters, quantizers, centres, reports."""
+        """Return states before the first step: of nodes' filters, central filters, quantizers, centres, reports."""
         central = {name: started(item) for name, item in self.central.items()}
         local = tuple(item.init() for item in self.alike)
         sent = tuple(item.init(self.n) for item in self.fusions)
@@ -95,15 +99,15 @@ class AllFilters(Module):
 
     @property
     def informed(self) -> tuple[Centre, ...]:
-        """The centres of filters whose gains depend on no data."""
+        """Centres of filters whose gains do not depend on data."""
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
     def matrices(self, centre: Centre, local: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
-        """Of a centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
+        """Matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
         return [self.alike[i].matrices(centre.read, local[i], f, self._quiet(i), u, k) for i, f in centre.sources]
 
     def followed(self, local: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """The nodes' states after step k, where what is heard is zero."""
+        """States of the nodes' filters after step k, for measurements of zero."""
         pairs = zip(self.alike, local, strict=True)
         return tuple(item.step(state, self._quiet(i), u, k)[0] for i, (item, state) in enumerate(pairs))
 
@@ -119,20 +123,22 @@ class AllFilters(Module):
         drawn: Mapping[str, Drawn] | None = None,
         skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
-        """One step of all filters from the measurements of each group, and from what happens to reports, by fusion.
+        """Step all filters with the measurements of each group, and with the draws of the uplinks, by fusion.
 
-        Gives "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of what has quantizers, and
-        "reports" with their delays by fusion, as the nodes send them; and what is retained where that is asked for,
+        Returns "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of fusions with quantizers, and
+        "reports" with their delays by fusion, as the nodes send them; if asked for, the smoother steps,
         "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
         `skip` has the reasons of the same form not to use data.
         """
         local, central, sent, known, reporting = states
+        # The nodes' filters.
         reasons = [None] * len(local) if skip is None else skip[0]
         results = [
             item.step(state, z[item.group], u, k, why)
             for item, state, why in zip(self.alike, local, reasons, strict=True)
         ]
         estimates = tuple(single.estimate for _, single in results)
+        # Central filters, on all measurements in the order of the nodes.
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
         received = {
@@ -142,21 +148,25 @@ class AllFilters(Module):
         fused = {name: single.estimate for name, (_, single) in received.items()}
         uplinks: dict[str, PyTree] = {}
         after = []
+        # Fusions of the estimates, through their quantizers.
         for item, state in zip(self.fusions, sent, strict=True):
             following, outcome, traffic = item.step(state, estimates, k)
             after.append(following)
             fused |= outcome
             uplinks |= traffic
+        # Informed centres, which propagate the joint moments of the errors.
         learned = []
         for centre, state in zip(self.centres, known, strict=True):
             following, outcome = self._centred(centre, state, local, z, estimates, u, k)
             learned.append(following)
             fused |= outcome
+        # Centres with reports over uplinks.
         published, reports = {}, {}
         for name, link in self.reporting.items():
             happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
             published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
             uplinks |= {name: traffic} if traffic else {}
+        # Next states and results.
         local, central = tuple(state for state, _ in results), {name: state for name, (state, _) in received.items()}
         following = local, central, tuple(after), tuple(learned), published
         result: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
@@ -178,7 +188,7 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[PyTree, dict[str, Estimate]]:
-        """A centre's step, which reads the matrices of its sources' steps before they are taken."""
+        """Step a centre, which reads the matrices of its sources' steps before they are taken."""
         parts = [
             self.alike[i].matrices(centre.read, local[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
         ]
@@ -188,12 +198,12 @@ class AllFilters(Module):
 
 @quickly_compiled
 def begun(filters: AllFilters) -> PyTree:
-    """States before the first step, by one program: one by one, their operations are a program each."""
+    """Return states before the first step, by one program: otherwise each operation is a program of its own."""
     return jax.tree.map(jnp.asarray, filters.init())
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
-    """The filters with what does not depend on data computed before, where all data arrive."""
+    """Precompute what does not depend on data, where all data arrive."""
     ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
     central = filters.central if all(filters.complete) else {}
     with jax.enable_x64(True):
@@ -208,7 +218,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
 def _plan(
     alike: tuple[Alike, ...], central: dict[str, AbstractFilter], smooths: bool, u: jax.Array | np.ndarray
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
-    """Of these filters alone: whatever a network's fusions are, it is one program."""
+    """Plan these filters alone: it is one program, whatever a network's fusions are."""
 
     def single(item: AbstractFilter, smooths: bool) -> AbstractFilter:
         return planned_with_past(item, u) if smooths else item.planned(u)
@@ -221,7 +231,7 @@ def _plan(
 
 
 def plans(filters: AllFilters) -> bool:
-    """Whether some filter has anything to compute before."""
+    """Test whether some filter has anything to precompute."""
     return any(
         type(item).planned is not AbstractFilter.planned
         for item in (*(part.filters for part in filters.alike), *filters.central.values())
@@ -229,7 +239,7 @@ def plans(filters: AllFilters) -> bool:
 
 
 def _reporting(network: Network) -> dict[str, Reporting]:
-    """The fusions that hear reports."""
+    """Fusions by reports, each with its uplinks and its centre."""
     results = {}
     for name, item in network.fused.items():
         if isinstance(item, Fusion) and item.by_report:
@@ -242,22 +252,25 @@ def _reporting(network: Network) -> dict[str, Reporting]:
 
 
 def centre_filter(network: Network, name: str) -> CentreFilter:
-    """The fusion `name` of the network, by `AllReports`, as a filter that hears the nodes' reports.
+    """Filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on the nodes' reports.
 
-    It hears, joined: of each node in the network's order what arrives of the report of this step, then of that of the
-    step before if links may be a step late, and so on; NaN for what did not arrive. What a quantizer adds is known by
-    its bound. Claim: as the fusion's.
+    The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
+    that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
+    the bound on its error. Claim: as the fusion's.
 
     Raises:
         ValueError: no fusion of this name, or one by another rule.
+
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """
     instance("network", network, Network, "a Network")
     text("fusion", name)
+    # A fusion by reports.
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
         observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
         raise fail("fusion", f"one of {observation}, which hear reports", repr(name))
+    # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
     alone = Network(
         network.plant,
@@ -266,6 +279,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         network.relays,
         network.common,
     )
+    # The uplinks as the centre models them.
     uplinks = uplinks_of(fusion, names, len(network.states))
     return CentreFilter(
         filters=AllFilters(alone),
@@ -282,7 +296,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
 
 def _with_only(node: Node | Listener, name: str) -> Node | Listener:
-    """A node with one of its filters."""
+    """Return a node with one of its filters."""
     filters = {single: item for single, item in node.filters.items() if single == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)

@@ -1,4 +1,4 @@
-"""A recorded signal through any channel."""
+"""Transmission of a recorded signal through any channel."""
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,19 @@ from heliograph.simulation.draws import CHANNEL, CHANNEL_START, checksum, draw_k
 SENDER = checksum("transmit")
 
 
-def transmit(signal: ArrayLike, channel: Channel, seed: int = 0) -> Float[np.ndarray, "steps outputs"]:
-    """What arrives of a recorded signal at the end of a channel, drawn anew at each step; links that remember do.
+def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0) -> Float[np.ndarray, "steps outputs"]:
+    """Transmit a recorded signal through a channel, with independent draws at each step; links with memory have theirs.
 
-    z_k = G_k y_k + n_k. NaN in the signal was not sent: what would be made of it (G_k not zero there) is NaN, all else
-    arrives. The result is NaN too where the channel loses it. A table of pandas or polars is a signal as well.
+    z_k = G_k y_k + n_k. NaN in the signal was not sent: outputs that depend on it (G_k not zero there) are NaN, all
+    others arrive. The result is NaN too where the channel loses it.
 
-    Shapes: signal (steps, inputs), or (steps,) for a channel with one input.
+    Args:
+        signal: (steps, inputs), or (steps,) for a channel with one input; a table of pandas or polars too.
+        channel: the channel.
+        seed: of the draws; 0 by default.
+
+    Returns:
+        The received signal (steps, outputs).
 
     Raises:
         ValueError: no channel, a signal of another shape or with infinite values, more steps than the channel covers.

@@ -1,4 +1,4 @@
-"""One step of everything: the plant moves, its nodes hear it, every filter is fed."""
+"""One step of a simulation: the plant moves, its nodes receive measurements, every filter is stepped."""
 
 import jax
 import jax.numpy as jnp
@@ -16,19 +16,19 @@ from heliograph.simulation.stepping import AllFilters
 
 
 class World(Module):
-    """A network as it is simulated: the plant, what is between it and the nodes, and all filters."""
+    """A network as it is simulated: the plant, the transmission to the nodes, and all filters."""
 
     plant: AnyPlant
     medium: AbstractMedium
     filters: AllFilters
 
     def init(self, key: jax.Array) -> PyTree:
-        """Before the first step of the run with this key."""
+        """Return the state before the first step of the run with this key."""
         x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
         return x, self.medium.init(key), self.filters.init()
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """After step k with the input u, and what there is to see of it: truth (n,), measurements, estimates."""
+        """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
         (x, medium, states), (k, u) = carry, row
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
@@ -41,7 +41,7 @@ class World(Module):
 
 
 def _near(plant: AbstractPlant, x: jax.Array, result: dict[str, PyTree]) -> dict[str, PyTree]:
-    """What was estimated, angles within half a turn of the truth: then x - xhat is the error, whoever subtracts."""
+    """Estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
         return result
 

@@ -1,4 +1,4 @@
-"""Estimates of earlier states from later data too: fixed interval, fixed lag, fixed point."""
+"""Smoothing: estimates of earlier states from later data too, with fixed interval, fixed lag or fixed point."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Whether a filter is consistent, by its own innovations: smoothing one that is not makes it worse."""
+"""Consistency of a filter, judged by its NIS: smoothing an inconsistent filter makes its claims worse."""
 
 import warnings
 from itertools import pairwise
@@ -10,14 +10,14 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 
-BLOCKS = 10  # parts of a run whose scatter tells how much of the surprise is chance
-DEVIATIONS = 3.5  # of the mean surprise: fewer may be chance
-EXCESS = 1.05  # times what is expected: less does little harm
+BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
+DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
+EXCESS = 1.05  # times the expected NIS: less does little harm
 
 
 @in_float64
 def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
-    """Of the blocks of one run, with surprise s = sum e' S^-1 e and h components: sums of s, h, s^2, s h, h^2."""
+    """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
     time = len(steps.mean)
@@ -28,7 +28,7 @@ def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
 
 
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
-    """Mean surprise of a component, 1 if the filter is consistent, and its standard error from the blocks' scatter."""
+    """Mean NIS per component, 1 for a consistent filter, and its standard error from the scatter of the blocks."""
     s, h, ss, sh, hh = (float(part) for part in sums)
     if not h:
         return 1.0, 0.0
@@ -37,7 +37,7 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 
 
 def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
-    """Warn if a filter's innovations are larger than it believes, by more than chance."""
+    """Warn if a filter's NIS is significantly larger than its model predicts."""
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
         warnings.warn(

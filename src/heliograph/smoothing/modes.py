@@ -1,4 +1,4 @@
-"""Which states are estimated anew, and from which data."""
+"""Smoothing modes: fixed interval, fixed lag and fixed point."""
 
 from typing import TypeVar
 
@@ -21,18 +21,18 @@ A = TypeVar("A", jax.Array, np.ndarray)
 
 @readable
 class AbstractSmoothing(Module):
-    """Which states are estimated from which later data, given what a filter retained of a run."""
+    """Choice of the states to be estimated, and of the later data that they are estimated from."""
 
     def estimates(self, steps: AbstractSmootherStep) -> Estimate:
-        """From steps stacked along time: estimates along time, with the claim that is left.
+        """Estimates along time from smoother steps stacked along time, with the claim that remains.
 
-        Warns where the filter's innovations say that it is not consistent: later data then make estimates worse.
+        Warns where the NIS of the filter says that it is not consistent: later data then make estimates worse.
         """
         warn_of("smoothing", np.asarray(nis_sums(steps)))
         return _swept(self, steps)
 
     def sweep(self, steps: AbstractSmootherStep) -> Estimate:
-        """The estimates, as `estimates`, of one run inside a compiled computation."""
+        """Compute the estimates of one run, like `estimates`, inside a compiled computation."""
         raise NotImplementedError
 
     def means(self, steps: AbstractSmootherStep) -> jax.Array:
@@ -44,7 +44,7 @@ class AbstractSmoothing(Module):
         return jnp.asarray(self.sweep(steps.without_data()).covariance)
 
     def about(self, values: A) -> A:
-        """Of something along time (..., time, n), such as the true state, what the estimates are about."""
+        """Select from `values` along time (..., time, n), such as the true state, those that the estimates refer to."""
         return values
 
     def check(self, horizon: int) -> None:
@@ -57,19 +57,22 @@ def _swept(smoothing: AbstractSmoothing, steps: AbstractSmootherStep) -> Estimat
 
 
 class FixedInterval(AbstractSmoothing):
-    """Every state given all data of the run."""
+    """Smoothing of every state given all data of the run."""
 
     def sweep(self, steps: AbstractSmootherStep) -> Estimate:
-        """(time, ...)."""
+        """Estimates (time, ...)."""
         return swept(steps)
 
     def means(self, steps: AbstractSmootherStep) -> jax.Array:
-        """(time, ...)."""
+        """Means (time, ...)."""
         return swept_means(steps)
 
 
 class FixedLag(AbstractSmoothing):
-    """Every state given the data of up to `lag` later steps; at the end of a run there are fewer.
+    """Smoothing of every state given the data of up to `lag` later steps; at the end of a run there are fewer.
+
+    Args:
+        lag: number of later steps, from 0.
 
     Raises:
         ValueError: a lag that is no whole number from 0.
@@ -81,12 +84,15 @@ class FixedLag(AbstractSmoothing):
         self.lag = check_count("lag", lag, 0)
 
     def sweep(self, steps: AbstractSmootherStep) -> Estimate:
-        """(time, ...)."""
+        """Estimates (time, ...)."""
         return swept_over_lag(steps, self.lag)
 
 
 class FixedPoint(AbstractSmoothing):
-    """The state after one step, counted from 0, given the data up to it and then up to each later step.
+    """Smoothing of the state after one step, given the data up to it and then up to each later step.
+
+    Args:
+        step: number of that step, from 0.
 
     Raises:
         ValueError: a step that is no whole number from 0.
@@ -98,22 +104,22 @@ class FixedPoint(AbstractSmoothing):
         self.step = check_count("step of a fixed point", step, 0)
 
     def sweep(self, steps: AbstractSmootherStep) -> Estimate:
-        """(time from that step on, ...)."""
+        """Estimates (time from that step on, ...)."""
         return carried_ahead(steps, self.step)
 
     def about(self, values: A) -> A:
-        """That step's, as often as there are estimates of it."""
+        """Repeat the value of that step, once per estimate of it."""
         result: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
         return result
 
     def check(self, horizon: int) -> None:
-        """One of the run's steps."""
+        """Raise ValueError if the step is not one of the run's."""
         if self.step >= horizon:
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
 
 
 def named_smoothing(name: str) -> AbstractSmoothing | None:
-    """From a word on the command line: "all" for the fixed interval, a number for a lag, nothing for none.
+    """Smoothing by a word of the command line: "all" for the fixed interval, a number for a lag, nothing for none.
 
     Raises:
         ValueError: another word.

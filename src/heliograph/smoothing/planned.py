@@ -1,4 +1,4 @@
-"""A smoother whose every matrix is known before any data: of many runs, only vectors are left to compute."""
+"""Precomputed smoother: with all matrices known before any data, only vectors are left to compute for each run."""
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,15 @@ from heliograph.smoothing.sweep import planned_with_past, quiet_steps, stepped
 
 @readable
 class PlannedSmoother(Module):
-    """What a linear filter and a sweep back over it come to before any data: covariances, and a map from z to means.
+    """Precomputed smoother of a linear filter: its covariances, and a map from z to smoothed means.
 
     For complete data: where a component is missing all means are NaN. Built by `planned_smoother`.
 
-    Shapes: estimate (time, n): means of data that say nothing, and the covariances of all data.
+    Args:
+        filter: the planned filter, with its smoother steps.
+        smoothing: which states are estimated from which data.
+        inputs: inputs of the plant (horizon, inputs).
+        estimate: means (time, n) for measurements that are zero, and the covariances (time, n, n) of all data.
     """
 
     filter: AbstractFilter
@@ -37,11 +41,18 @@ class PlannedSmoother(Module):
 
 
 def planned_smoother(
-    filter: AbstractFilter, horizon: int, smoothing: AbstractSmoothing, inputs: ArrayLike | None = None
+    filter: AbstractFilter,
+    horizon: int,
+    smoothing: AbstractSmoothing,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> PlannedSmoother:
-    """All that smoothing a linear filter over `horizon` steps of complete data needs, computed once for all runs.
+    """Precompute the smoother of a linear filter over `horizon` steps of complete data, once for all runs.
 
-    Shapes: inputs (horizon, inputs).
+    Args:
+        filter: a filter whose gains do not depend on data.
+        horizon: number of steps.
+        smoothing: which states are estimated from which data, such as `FixedInterval()`.
+        inputs: inputs of the plant (horizon, inputs); by default a filter without inputs is assumed.
 
     Raises:
         ValueError: a filter whose gains depend on data or that cannot be smoothed, inputs that are not the filter's.

@@ -1,4 +1,4 @@
-"""Sweeps over what a filter retained of one run: back from its end, back over a lag, or ahead with one state."""
+"""Passes over the smoother steps of one run: back from its end, back over a lag, or ahead with one state."""
 
 from typing import TypeVar
 
@@ -12,23 +12,26 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_count, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 T = TypeVar("T")
 
 
 def smoother_steps(
     filter: AbstractFilter,
-    measurements: ArrayLike,
-    inputs: ArrayLike | None = None,
+    measurements: Float[ArrayLike, "steps received"],
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
     state: PyTree | None = None,
     first_step: int = 0,
 ) -> tuple[PyTree, AbstractSmootherStep]:
-    """Step a filter over rows of data: its state after them, and what it retained of each, stacked along time.
+    """Step a filter over rows of data: its state after them, and its smoother steps stacked along time.
 
-    From `state`, the filter's start unless given, at the step number `first_step`.
-
-    Shapes: measurements (steps, received), NaN for what did not arrive; inputs (steps, inputs).
+    Args:
+        filter: a filter that can be smoothed.
+        measurements: rows (steps, received), NaN for what did not arrive.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+        state: state before the first row; the filter's initial state by default.
+        first_step: number of the first row's step; 0 by default.
 
     Raises:
         ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
@@ -45,7 +48,7 @@ def smoother_steps(
 def stepped(
     item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
 ) -> tuple[PyTree, AbstractSmootherStep]:
-    """The same inside a compiled computation."""
+    """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractSmootherStep]:
         return item.step_with_smoother(state, *row)
@@ -55,7 +58,7 @@ def stepped(
 
 
 def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
-    """The filter planned for these inputs and complete data, with all that a sweep back needs and no data change."""
+    """Plan the filter for these inputs and complete data, with its smoother steps but for their data."""
     planned = item.planned(inputs)
     if planned is item:
         return item
@@ -63,19 +66,19 @@ def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
 
 
 def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractSmootherStep:
-    """What a filter retains of data that say nothing: for one whose gains no data change, all but means is right."""
+    """Smoother steps for measurements of zero: right but for means, if no gain depends on data."""
     quiet = jnp.zeros((len(inputs), item.received))
     steps: AbstractSmootherStep = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
     return steps
 
 
 def swept(steps: AbstractSmootherStep) -> Estimate:
-    """Each step's state given all data: one sweep back."""
+    """Estimate each step's state given all data: one backward pass."""
     return Estimate(*_both(steps), steps.claim)
 
 
 def swept_means(steps: AbstractSmootherStep) -> jax.Array:
-    """Its means alone."""
+    """Means of each step's state given all data."""
     return _means(steps)
 
 
@@ -96,12 +99,14 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
         result = step.estimate_from(moments)
         return jnp.asarray(result.mean), jnp.asarray(result.covariance)
 
+    # One step back: the adjoint or the moments, and the smoothed state before the step.
     def body(carry: PyTree, item: tuple[AbstractSmootherStep, AbstractSmootherStep]) -> tuple[PyTree, PyTree]:
         (later, known), (before, step) = carry, item
         earlier = step.back(later, before.mean, before.covariance)
         moments = step.before(before, earlier, known)
         return (earlier, moments), estimate_from(before, moments)
 
+    # From the last step, whose smoothed state is the filtered one.
     last = row(steps, -1)
     rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
     start = last.end(), last.smoothed(last.end())
@@ -115,7 +120,7 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
 
 
 def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Estimate:
-    """Each step's state given the data of up to `lag` later steps: as many short sweeps, side by side."""
+    """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
     items = jnp.arange(last + 1)
     ends = rows_of(steps, jnp.minimum(items + lag, last))
@@ -141,7 +146,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
 
 
 def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
-    """The state after one step given the data up to it, and up to each later one."""
+    """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
     def body(point: Point, item: PyTree) -> tuple[Point, Moments]:
@@ -156,13 +161,13 @@ def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
 
 
 def row(steps: T, k: int) -> T:
-    """One step of what is stacked along time."""
+    """Return one step of what is stacked along time."""
     result: T = jax.tree.map(lambda leaf: leaf[k], steps)
     return result
 
 
 def rows_of(steps: T, which: slice | jax.Array) -> T:
-    """Some steps of what is stacked along time."""
+    """Return some steps of what is stacked along time."""
     result: T = jax.tree.map(lambda leaf: leaf[which], steps)
     return result
 

@@ -1,4 +1,4 @@
-"""What filters share whose state is a mean and a covariance: where it begins, how it moves, what it says."""
+"""Filters whose state is a mean and a covariance: their prior, prediction and estimate."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,10 @@ class Belief(NamedTuple):
 
 
 class AbstractBeliefFilter(AbstractFilter):
-    """A filter whose state is a `Belief`, predicted by a transform, or exactly where the plant is linear."""
+    """A filter whose state is a `Belief`, predicted by a transform, or exactly where the plant is linear.
+
+    Shapes: initial_mean (n,), initial_covariance (n, n).
+    """
 
     plant: AnyPlant
     transform: AbstractTransform
@@ -38,7 +41,7 @@ class AbstractBeliefFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Belief:
-        """The prior."""
+        """Return the belief before any data."""
         return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
 
     @predicts
@@ -48,7 +51,7 @@ class AbstractBeliefFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
-        """The belief, angles between -pi and pi."""
+        """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
 
@@ -64,7 +67,7 @@ def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief,
 def prior_of(
     plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
 ) -> tuple[Array, Array, bool]:
-    """The plant's initial mean and covariance where no others are given, and whether any were."""
+    """Return initial mean (n,) and covariance (n, n), the plant's where None is given, and whether any was given."""
     n = len(plant.states)
     mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
     spread = plant.initial_covariance

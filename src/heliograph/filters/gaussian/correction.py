@@ -1,6 +1,7 @@
-"""The arithmetic of an update behind an uncertain channel: gain and bound.
+"""Gain and covariance bound of an update behind an uncertain channel.
 
-Notation as in `update`: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n what arrives.
+Notation as in `update`: e the prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the
+measurement.
 """
 
 from functools import partial
@@ -37,10 +38,10 @@ from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
 class Signal(NamedTuple):
-    """The sensor's signal as the filter sees it before the measurement.
+    """Prior moments of the sensor's signal y.
 
-    mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m). Of a linear
-    sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update keeps its digits.
+    Shapes: mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m). For a
+    linear sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update avoids cancellation.
     """
 
     mean: jax.Array
@@ -51,13 +52,17 @@ class Signal(NamedTuple):
     noise: jax.Array | None = None
 
     def about_mean(self) -> "Signal":
-        """y - E y: all that the update behind a known gain depends on, whatever was estimated before."""
+        """Return the moments of y - E y: all that the update behind a known gain depends on, whatever was estimated."""
         return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
 
 
 @readable
 class Scalars(Module):
     """Fixed positive scalars (beta_1, beta_2) of Young's inequality, as published bounds use them.
+
+    Args:
+        first: beta_1 > 0.
+        second: beta_2 > 0.
 
     Raises:
         ValueError: a scalar that is not positive.
@@ -72,14 +77,14 @@ class Scalars(Module):
 
 
 def as_array(scalars: Scalars | None) -> np.ndarray:
-    """Two numbers, NaN where the trace is to be minimised over them."""
+    """Scalars as two numbers, NaN where the trace is to be minimised over them."""
     if scalars is None:
         return np.full(2, np.nan)
     return instance("scalars", scalars, Scalars, "Scalars").values
 
 
 def as_scalars(values: np.ndarray) -> Scalars | None:
-    """The way back."""
+    """Scalars from two numbers, None for NaN: the inverse of `as_array`."""
     return None if np.isnan(values).any() else Scalars(*values)
 
 
@@ -91,13 +96,15 @@ def _shapes_of_update(prior: jax.Array, signal: Signal, channel: SecondOrder, pr
 def young_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The update of `Polytope` for any description of the channel; scalars (2,), NaN where they are to be found."""
+    """Gain and bound of `Polytope` for any description of the channel; scalars (2,), NaN to optimise them."""
     if not channel.uncertain:
         return _known_gain_correction(prior, signal, channel, present)
+    # M Cov(y) M' of the components that arrived, and the cross covariance C = M E[e_y e'].
     w = homogeneous(signal.second, signal.mean, 1.0)
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     cross = _cross(signal, channel, present)
+    # Omega = spread + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) M Cov(y) M', at the scalars of least trace.
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
@@ -127,7 +134,7 @@ def _cross(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Arra
 
 @runs_last
 def known_gain_covariance(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Omega of a channel whose mean gain is known: the covariance of z, or what dominates it, that gives the gain."""
+    """Omega of a channel whose mean gain is known: the covariance of z, or a bound on it, that gives the gain."""
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     return _of_known_gain(channel, homogeneous(signal.second, signal.mean, 1.0), present) + mean_part
@@ -142,26 +149,29 @@ def _of_known_gain(channel: SecondOrder, w: jax.Array, present: jax.Array) -> ja
 def zero_mean_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The update of `ZeroMean`; scalar (1,), NaN where it is to be found."""
+    """Gain and bound of `ZeroMean`; scalar (1,), NaN to optimise it."""
     if not channel.uncertain:  # power(Pyy) = M Pyy M' + spread(Pyy): no other than Young's
         return _known_gain_correction(prior, signal, channel, present)
+    # E[y y'] divided: yhat yhat' is known, Cov y is not.
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     unknown_part = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     cross = _cross(signal, channel, present)
     base = channel.power(unknown_part, present) + channel.spread(known_part, present) + absent(present)
     shift, power = channel.shift(unknown_part, present), times(cross, transpose(cross))
+    # Power of the prior error that the received components explain, C Pyy^+ C'.
     used = received(channel, present)
     among = jnp.where(used[:, None] & used[None], signal.covariance, 0.0)
     of_used = jnp.where(used, signal.cross, 0.0)
     explained = symmetric(times(of_used, solve(among, transpose(of_used))))
 
+    # Omega = base + shift / beta and bound + beta times what is explained, at the best beta.
     beta = smallest_scalars(zero_mean_sweep, scalar, (base, shift, power, trace(explained)))[0]
     gain, bound = gain_and_bound(prior, cross, base + shift / beta)
     return gain, bound + beta * explained
 
 
 def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Which components of the signal have a part in what arrived: the others say nothing, as if never measured."""
+    """Mask (p,) of the components of the signal that act on what arrived; the others count as never measured."""
     m, p = channel.mean_gain.shape[:2]
     reached = (channel.power.center != 0) | (channel.power.radius != 0)
     parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
@@ -186,7 +196,7 @@ def absent(present: jax.Array) -> jax.Array:
 def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
     """K = C' Omega^-1 and P - C' Omega^-1 C, which minimise P - K C - C' K' + K Omega K'.
 
-    The difference is known to rounding of P alone, which the bound carries.
+    The difference is accurate to rounding of P alone, which the bound includes.
     """
     solved = _solved(omega, cross)
     return transpose(solved), _bound(prior, cross, solved)
@@ -195,12 +205,12 @@ def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tupl
 def gain_and_covariance(
     prior: jax.Array, cross: jax.Array, omega: jax.Array, output: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The same of z = H x + noise, with H (m, n) and the noise's covariance N (m, m), Omega = H P H' + N.
+    """Gain and covariance for z = H x + noise, with H (m, n) and noise covariance N (m, m), Omega = H P H' + N.
 
-    Where a measurement is precise, N far below Omega, the difference has lost the digits of what is left:
-    (1 + (m + 2) eps) P - K C is eps Omega / N too large. There `precise_update` takes one component after another. It
-    takes several times the products, so it is computed for all runs where any needs it, and not otherwise; each run's
-    own numbers decide which of the two it gets.
+    Where a measurement is precise, N far below Omega, the difference cancels: (1 + (m + 2) eps) P - K C is
+    eps Omega / N too large. There `precise_update` uses one component after another. It takes several times the
+    products, so it is computed for all runs where any needs it, and not otherwise; each run's numbers decide which of
+    the two applies.
     """
     return _gain_and_covariance(prior, cross, omega, _solved(omega, cross), output, noise)
 
@@ -218,9 +228,10 @@ _bound = runs_last(_difference)
 def covariance_after(
     prior: jax.Array, cross: jax.Array, omega: jax.Array, solved: jax.Array, output: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """P+ of the gain solved' = C' Omega^-1, in the form that keeps its digits (`gain_and_covariance`).
+    """P+ of the gain solved' = C' Omega^-1, in the form that avoids cancellation (`gain_and_covariance`).
 
-    (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK of the gain changes by dK Omega dK' alone.
+    Joseph form: (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK of the gain changes by
+    dK Omega dK' alone.
 
     Source: Bucy and Joseph, Filtering for stochastic processes (1968).
     """
@@ -266,8 +277,8 @@ _gain_and_covariance = runs_last(partial(_by_precision, where_any), partial(_by_
 
 
 def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
-    """Whether some component's noise, given those before it, is far below what is unknown of it.
+    """Test whether some component's noise, given those before it, is far below its innovation variance.
 
-    So a combination of components that is free of noise counts, though none of them is.
+    So a combination of components that is free of noise counts, though no single component is.
     """
     return jnp.any(pivots(noise) < rounding(PRECISE, omega, 1000) * diagonal_of(omega), axis=0)

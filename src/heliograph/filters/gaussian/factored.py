@@ -1,4 +1,4 @@
-"""Linear, extended and cubature filters with a factored covariance: the form for single precision."""
+"""Linear, extended and cubature filters with a factored covariance L D L': the form for single precision."""
 
 from typing import NamedTuple
 
@@ -45,14 +45,14 @@ class Moments(NamedTuple):
 
 
 class FactoredBelief(NamedTuple):
-    """The estimate, and the state's own moments before any data where the gain's spread acts on these (else none)."""
+    """Estimate, and the moments of the state before any data where the gain's spread acts on these (else None)."""
 
     estimate: Moments
     before_data: Moments | None
 
 
 class Image(NamedTuple):
-    """f(x) of x = m + L xi, Cov xi = diag(d): its mean, its slopes in xi (rows, n), and what is not linear in xi."""
+    """f(x) of x = m + L xi, Cov xi = diag(d): its mean, its slopes in xi (rows, n), and the part not linear in xi."""
 
     mean: jax.Array
     slopes: jax.Array
@@ -60,13 +60,12 @@ class Image(NamedTuple):
 
 
 class FactoredFilter(AbstractFilter):
-    """The same filter as one of `GaussianFilter` or `LinearFilter`, its covariance carried as L D L'.
+    """A `GaussianFilter` or `LinearFilter` whose covariance is carried as L D L'.
 
     With y = H x + e and z = G y + n, M = E[G], K_r the operators of the gain's spread, the noise of z given x is the
     sum of squares of M (e, R) and of K_r (y, 1): its factors turn z into components with uncorrelated noises, which are
-    used one after another. No covariance is the difference of others. Of a cubature rule, the odd part of f at
+    used one after another. No covariance is a difference of others. For a cubature rule, the odd part of f at
     m +- sqrt(n) L_j is linear in xi, and the even part is one more noise: so f needs no other update than H x.
-
     Equal to the base in exact arithmetic, but for what that adds for its rounding. Claim: the base's.
     """
 
@@ -88,7 +87,7 @@ class FactoredFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> FactoredBelief:
-        """The prior."""
+        """Return the factored belief before any data."""
         root = columns_of(np.asarray(self.initial_covariance))
         start = Moments(jnp.asarray(self.initial_mean), factors_of(joined([root])))
         return FactoredBelief(start, start if self.from_prior else None)
@@ -102,7 +101,7 @@ class FactoredFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: FactoredBelief, z: ArrayLike, k: Step = 0) -> tuple[FactoredBelief, Innovation]:
-        """Use the components of z that arrived."""
+        """Correct with the components of z that arrived."""
         mean_gain, offset, spread = (at(part, k) for part in (self.mean_gain, self.offset, self.spread))
         sensor, (mean, factors) = at(self.sensor, k), state.estimate
         signal = self._signal(sensor, state.estimate)
@@ -110,22 +109,25 @@ class FactoredFilter(AbstractFilter):
         of_signal = [*signal.curvature, columns_of(_known(sensor.noise.covariance))]
         noise = [Columns(mean_gain @ part.matrix, part.weights) for part in of_signal]
         noise += self._spread(spread, sensor, state, signal, of_signal)
+        # Slopes of z and its innovation, zero rows for what did not arrive.
         expected = mean_gain @ signal.mean + offset
         z = nearest(jnp.asarray(z), expected, self.angles)
         present = ~jnp.isnan(z)
         rows = jnp.concatenate([mean_gain @ signal.slopes, jnp.where(present, z - expected, 0.0)[:, None]], axis=1)
         rows = jnp.where(present[:, None], rows, 0.0)
+        # Decorrelate the noises: z is L^-1 z with uncorrelated components.
         masked = joined(noise)
         lower, variances = gram_schmidt(masked._replace(matrix=jnp.where(present[:, None], masked.matrix, 0.0)))
         rows = decorrelated(lower, rows)
         after = _used(mean, factors, rows, jnp.where(present, variances, 1.0))
+        # Innovation covariance S = M H L D L' H' M' + noise.
         known = Columns(mean_gain @ signal.slopes, factors.variances)
         total = sum_of(joined([known, masked]))
         return FactoredBelief(after, state.before_data), gaussian_innovation(z, expected, total)
 
     @in_float64
     def estimate(self, state: FactoredBelief) -> Estimate:
-        """The estimate's mean, angles between -pi and pi, and covariance."""
+        """Mean of the estimate, angles between -pi and pi, and its covariance."""
         mean, factors = state.estimate
         return Estimate(wrapped(mean, first(self.plant).angles), factors.covariance(), self.claim)
 
@@ -156,7 +158,7 @@ class FactoredFilter(AbstractFilter):
     def _spread(
         self, spread: Array, sensor: AbstractSensor, state: FactoredBelief, signal: Image, of_signal: list[Columns]
     ) -> list[Columns]:
-        """The columns of K_r (y, 1), y as the estimate has it or as it was before data."""
+        """Columns of K_r (y, 1), with y of the estimate or of the state before data."""
         corner = np.zeros(spread.shape[-1])
         corner[-1] = 1.0
         if not self.random_gain:
@@ -178,12 +180,12 @@ def _known(covariance: Array) -> Array:
 
 
 def linear_image(function: Function, state: Moments) -> Image:
-    """By the Jacobian J at the mean: slopes J L."""
+    """Linearise at the mean with the Jacobian J: slopes J L."""
     return Image(function(state.mean), jax.jacfwd(function)(state.mean) @ state.factors.matrix(), [])
 
 
 def cubature_image(function: Function, state: Moments) -> Image:
-    """By the points m +- sqrt(n d_j) L_j: their odd part over sqrt(n d_j) is the slope, their even part a noise."""
+    """Cubature at m +- sqrt(n d_j) L_j: the odd part over sqrt(n d_j) is the slope, the even part a noise."""
     n = len(state.mean)
     steps = jnp.sqrt(n * state.factors.variances)
     offsets = state.factors.matrix() * steps
@@ -196,7 +198,7 @@ def cubature_image(function: Function, state: Moments) -> Image:
 
 
 def _used(mean: jax.Array, factors: Factors, rows: jax.Array, noise: jax.Array) -> Moments:
-    """One component after another: rows (slopes, innovation), whose noises are uncorrelated."""
+    """Update by one component after another: rows (slopes, innovation), whose noises are uncorrelated."""
     n, variances = len(mean), jnp.asarray(factors.variances)
     left, news = jnp.concatenate([factors.matrix(), rows[:, :-1]]), jnp.concatenate([mean, -rows[:, -1]])
     for i in range(len(rows)):
@@ -207,11 +209,12 @@ def _used(mean: jax.Array, factors: Factors, rows: jax.Array, noise: jax.Array) 
 
 
 def factored(base: AbstractFilter) -> AbstractFilter:
-    """The filter with a factored covariance, whose variances stay positive in single precision.
+    """Return the filter with a factored covariance, whose variances stay positive in single precision.
 
     Raises:
         ValueError: a filter for which this form is not derived.
     """
+    # Only filters whose update is linear in the state, or a cubature of it.
     expected = "a linear, extended or cubature filter, or a schedule of gains"
     if not isinstance(base, GaussianFilter | LinearFilter):
         raise fail("single precision", expected, type(base).__name__)
@@ -220,12 +223,14 @@ def factored(base: AbstractFilter) -> AbstractFilter:
     transform = None if isinstance(base, LinearFilter) else base.transform
     if not linear and not isinstance(transform, Cubature | Linearization):
         raise fail("single precision", expected, f"one with {type(transform).__name__}")
+    # Operators K_r of the random gain, E[(G - M) Y (G - M)'] = sum_r K_r Y K_r'.
     spread = gain_spread(base.channel)
     operators = spread.values if isinstance(spread, OverTime) else spread
     random_gain = bool(np.any(operators[..., :-1]))
     described = base.channel
     over = isinstance(described, OverTime)
     whole: SecondOrder = described.values if isinstance(described, OverTime) else described
+    # A linear filter weighs them by the state's moments before data, a Gaussian one by its estimate.
     by_prior = isinstance(base, LinearFilter)
     return FactoredFilter(
         plant=base.plant,

@@ -1,7 +1,7 @@
-"""Covariances as L D L': the factors of sums of squares, of small matrices, and of an update by one measurement.
+"""Covariances as L D L': factors of sums of squares, of small matrices, and of an update by one measurement.
 
 L is unit lower triangular and D diagonal, so a variance is a sum of positive terms in whatever precision: nothing is
-ever subtracted from one. Written out by rows, as straight-line code takes it.
+ever subtracted from one. Written out by rows, for straight-line code.
 """
 
 from typing import NamedTuple
@@ -43,26 +43,27 @@ class Factors(NamedTuple):
 
 
 def joined(parts: list[Columns]) -> Columns:
-    """The sum of covariances: their columns one after another."""
+    """Sum of covariances: their columns one after another."""
     matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
     return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
 
 
 def sum_of(columns: Columns) -> jax.Array:
-    """The covariance itself, W diag(w) W'."""
+    """Covariance of these columns, W diag(w) W'."""
     return jnp.asarray((columns.matrix * columns.weights) @ columns.matrix.T)
 
 
 def gram_schmidt(columns: Columns) -> tuple[jax.Array, jax.Array]:
     """L (n, n) and d (n,) with L diag(d) L' = W diag(w) W', by orthogonalising the rows of W from the first one down.
 
-    A row that those above it make up entirely has d = 0 and gives nothing to those below.
+    A row that depends linearly on those above has d = 0 and contributes nothing to those below.
 
     Source: Thornton, Triangular covariance factorizations for Kalman filtering (1976), modified weighted Gram-Schmidt.
     """
     n = columns.matrix.shape[0]
     rest = [columns.matrix[i] for i in range(n)]
     lower, variances = jnp.eye(n), []
+    # d_j = |row j|^2 in the weights w, then row j is projected out of the rows below.
     for j in range(n):
         weighted = rest[j] * columns.weights
         variances.append(jnp.sum(weighted * rest[j]))
@@ -75,7 +76,7 @@ def gram_schmidt(columns: Columns) -> tuple[jax.Array, jax.Array]:
 
 
 def factors_of(columns: Columns) -> Factors:
-    """The factors of a sum of squares."""
+    """Factors of a sum of squares."""
     lower, variances = gram_schmidt(columns)
     return Factors(lower[np.tril_indices(len(variances), -1)], variances)
 
@@ -91,15 +92,16 @@ def decorrelated(lower: jax.Array, rows: jax.Array) -> jax.Array:
 def measured(
     rows: jax.Array, variances: jax.Array, f: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One scalar z = f' xi + n of xi with variances d, Var n = r: rows V+, variances d+ and the gain V diag(d) f / s.
+    """Update by one scalar z = f' xi + n: rows V+, variances d+ and the gain V diag(d) f / s.
 
-    V diag(d) V' is the covariance of the rows before, V+ diag(d+) V+' that of what is left, s = f' diag(d) f + r. V
-    (rows, n) may hold more than the state's rows: those of measurements still to come change alike. Each d is
-    multiplied by a ratio of sums of positive terms, and nothing is subtracted from it.
+    V diag(d) V' is the prior covariance of the rows, V+ diag(d+) V+' the posterior one, xi has variances d, n the
+    variance r, and s = f' diag(d) f + r. V (rows, n) may hold more than the state's rows: those of measurements still
+    to come change alike. Each d is multiplied by a ratio of sums of positive terms, and nothing is subtracted from it.
 
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), Section V.3, the order of the
     components reversed, since L is lower.
     """
+    # Bierman's recursion, from the last component up: s grows by f_j^2 d_j.
     n = len(variances)
     total, inverse, gain = noise, reciprocal(noise), jnp.zeros(len(rows))
     columns, after = [rows[:, 0]] * n, [noise] * n
@@ -108,6 +110,7 @@ def measured(
         before, total = total, total + f[j] * part
         columns[j] = rows[:, j] - (f[j] * inverse) * gain
         inverse = reciprocal(total)
+        # d_j+ = d_j s_{j+1} / s_j.
         after[j] = jnp.where(total > 0, variances[j] * (before * inverse), variances[j])
         gain = gain + rows[:, j] * part
     return jnp.stack(columns, axis=1), jnp.stack(after), gain * inverse
@@ -120,7 +123,7 @@ def reciprocal(value: jax.Array) -> jax.Array:
 
 
 def columns_of(covariance: Array) -> Columns:
-    """Of a covariance: where its numbers are known, as many columns as its rank; else L and d by elimination."""
+    """Columns of a covariance: as many as its rank where it is a NumPy array; else L and d by elimination."""
     if isinstance(covariance, np.ndarray):
         root = columns_of_known(covariance)
         return Columns(root, np.ones(root.shape[1]))
@@ -135,14 +138,16 @@ def columns_of(covariance: Array) -> Columns:
 
 
 def columns_of_known(covariance: np.ndarray) -> np.ndarray:
-    """W (n, rank) with W W' = P, by Cholesky's method with pivots in each component's own unit.
+    """W (n, rank) with W W' = P, by Cholesky's method with pivots, each component scaled to unit variance.
 
     Raises:
         ValueError: a matrix that is no covariance.
     """
+    # Correlations: the rank is decided in units of each component's deviation.
     unit = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     scale = np.where(unit > 0, unit, 1.0)
     rest, columns = covariance / np.outer(scale, scale), []
+    # Pivot: the largest remaining variance.
     for _ in range(len(covariance)):
         j = int(np.argmax(np.diagonal(rest)))
         if rest[j, j] <= ROUNDING:

@@ -1,4 +1,4 @@
-"""The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
+"""Gaussian filter: mean and covariance by a transform (cubature, Jacobian), on the channel's second moments."""
 
 from dataclasses import replace
 from typing import TypeVar
@@ -40,11 +40,11 @@ class GaussianFilter(AbstractBeliefFilter):
 
     A linear plant or sensor needs no transform: its moments are exact.
 
-    `channel` is what the filter believes; the world may have another. Its innovation covariance is M Cov(y) M' and the
+    `channel` is the filter's model; the world may have another. Its innovation covariance is M Cov(y) M' plus the
     spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
 
     `linear`: plant and sensor are, no gain is random and nothing is an angle, so that nothing but the mean depends on
-    data. `observed_angles`: which components of z are angles; z is then read within half a turn of what is expected.
+    data. `observed_angles`: which components of z are angles; z is then read within half a turn of its expectation.
     """
 
     sensor: AnySensor
@@ -55,7 +55,7 @@ class GaussianFilter(AbstractBeliefFilter):
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
-        """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
+        """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         unknown = signal.about_mean() if self.linear else signal
         size = initial_size(self.initial_mean, self.initial_covariance)
@@ -65,7 +65,7 @@ class GaussianFilter(AbstractBeliefFilter):
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
-        """The update itself where it is linear, else the moments around it."""
+        """Return the linear update itself where it is linear, else the moments around it."""
         plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
@@ -78,12 +78,12 @@ class GaussianFilter(AbstractBeliefFilter):
         return replace(result, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before, where they do not depend on data."""
+        """Precompute all covariances and gains, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
 
 
 def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
-    """What the sensor is expected to send of this plant's state."""
+    """Moments of the sensor's signal y = h(x) + v under the belief of x."""
     if isinstance(sensor, LinearSensor):
         measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
     else:
@@ -104,7 +104,7 @@ def corrected(
     angles: Angles = (),
     unknown: Signal | None = None,
 ) -> tuple[Belief, Innovation]:
-    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing.
+    """Correct a belief with the components of z that arrived; without any, it stays as it is.
 
     `size`: E[x_i^2] at the start, (n,), of which the rounding stays unknown.
     `unknown`: what of the signal decides gain and covariance, where that is less than all.
@@ -129,7 +129,7 @@ def _use(
 
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
-    """The channel as an update reads it, for each step where it varies."""
+    """Second moments of the channel in the form of the update, for each step where it varies."""
     if isinstance(channel, OverTime):
         return over_time([update.describe(c) for c in unstack(channel)])
     return update.describe(channel)
@@ -145,15 +145,18 @@ def _build(
     initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
+    # Checks, and the prior.
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
     mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    # Moments of the channel, its memory ignored.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
     pairs = zip(_over_steps(channel), _over_steps(described), strict=True)
+    # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
@@ -184,18 +187,27 @@ def gaussian_filter(
     channel: Channel,
     transform: AbstractTransform,
     update: AbstractUpdate | None = None,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+    """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
+            nominal.
+        transform: moments of a nonlinear function; a linear plant or sensor needs none.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
 
     Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
-    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
-    plant's unless given.
+    (then it is the Kalman filter).
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
     Source: cubature fusion under amplify-and-forward relays, Section III.
     """
     rule = Polytope() if update is None else update
@@ -207,18 +219,26 @@ def cubature_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """Cubature Kalman filter that knows its channel's moments.
+    """Cubature Kalman filter on its channel's second moments.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
+            nominal.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
 
     Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
-    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
-    plant's unless given.
+    (then it is the Kalman filter).
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
     Source: cubature fusion under amplify-and-forward relays, Section III.
     """
     return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
@@ -229,15 +249,24 @@ def extended_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """Extended Kalman filter that knows its channel's moments; Jacobians by automatic differentiation.
+    """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
-    Claims, arguments and errors as `cubature_filter`.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: as `cubature_filter`.
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
     Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
     """
     return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
@@ -247,15 +276,23 @@ def mean_gain_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """The cubature filter that most people would write: it takes the mean gain as the truth.
+    """Cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
 
-    Claim: "nominal", and badly so where gains are random; it is here to be compared with.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter; only its mean gain is used.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "nominal", and far too small where gains are random.
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+
     Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
     """
     believed = mean_gain(without_memory(channel))

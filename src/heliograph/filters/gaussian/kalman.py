@@ -1,4 +1,4 @@
-"""The plain Kalman filter: a linear plant, a linear sensor, and nothing in between."""
+"""Plain Kalman filter: a linear plant and a linear sensor without a channel."""
 
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
 from heliograph.filters.gaussian.transform import Linearization
@@ -7,23 +7,30 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 
 def kalman_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
-    """The Kalman filter of a linear plant whose linear sensor is heard as it is, without a relay.
+    """Kalman filter of a linear plant whose linear sensor is received directly.
 
     P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
 
-    Claim: "exact" from the plant's own initial law, whatever the laws' shapes; "nominal" from another, and with angles.
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "exact" from the plant's initial law, whatever the laws' shapes; "nominal" from another, and with angles.
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, an initial covariance that is none.
+
     Source: Kalman, A new approach to linear filtering and prediction problems (1960).
     """
     if not is_linear(plant, sensor):

@@ -1,7 +1,7 @@
-"""Precise measurements: what little they leave of a variance, to as many digits as the prior has.
+"""Updates by precise measurements that give posterior variances as many digits as the prior has.
 
-One component after another on a root of the covariance, since of two precise components together the innovation's
-covariance H P H' + N keeps neither what tells them apart nor N.
+One component after another on a root of the covariance: of two precise components together, the innovation covariance
+H P H' + N resolves neither their difference nor N.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ LEFT = 100  # times its rounding: a variance below has lost its digits
 
 
 class Component(NamedTuple):
-    """One component of T z, whose rows make their noises uncorrelated.
+    """One component of T z, whose rows make the noises of the components uncorrelated.
 
     Shapes: number e_j (m,), row T H of it and size |T| |H|, of which it is a difference (n,), the noise's variance (),
     least variance that is not rounding (); or of all components, one more axis first. Runs last.
@@ -43,7 +43,7 @@ class Component(NamedTuple):
 
 
 def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """K (n, m) and P+ of z = H x + v, Cov v = N, by its components one after another; of runs that are last.
+    """K (n, m) and P+ of z = H x + v, Cov v = N, by its components one after another; the axis of runs is last.
 
     f = R' h', s = f' f + d, k = R f / s, R+ = R (I - f f' / (s + root(s d))); with K of all
     P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. The mean itself
@@ -59,6 +59,7 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     """
     n, m = len(prior), len(output)
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
+    # Square root of P, and the components of z with uncorrelated noises.
     start = root(prior)
     turn, components = _components(start, output, noise)
     nothing = jnp.zeros((n, m, *runs), start.dtype)
@@ -73,7 +74,7 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
-    """T (m, m) and the components of T z; what was taken off a row left its rounding there."""
+    """T (m, m) and the components of T z, with the rounding that the elimination leaves in each row."""
     m, n = output.shape[:2]
     ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
     turned, variance = uncorrelated(noise, jnp.concatenate([ones, output], axis=1))
@@ -85,7 +86,7 @@ def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[
 
 
 def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
-    """Whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the square of the mean's rounding."""
+    """Test whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the mean's rounding squared."""
     n, eps = len(prior), float(np.finfo(prior.dtype).eps)
     remaining, left = jnp.abs(remaining), diagonal_of(after)
     lost, reach = summed(times(remaining, jnp.abs(prior)) * remaining, 1), times(remaining, jnp.abs(start))

@@ -1,7 +1,7 @@
-"""The scalars of Young's inequality that make a bound smallest, by Newton's method on their logarithms.
+"""Scalars of Young's inequality that minimise a bound, by Newton's method on their logarithms.
 
-At the least trace each scalar is a ratio of traces that the gain decides, beta = f(beta): with W = K' K of the gain for
-beta, tr(K S K') = tr(W S). A sweep gives log f and its slopes; both follow from W and Omega^-1 S, since for dOmega
+At the least trace each scalar is a ratio of traces that the gain decides, beta = f(beta): with W = K' K of the gain
+for beta, tr(K S K') = tr(W S). A sweep gives log f and its slopes; both follow from W and Omega^-1 S, since for dOmega
 tr(dW X) = -2 tr(Omega^-1 dOmega W X).
 """
 
@@ -27,12 +27,13 @@ Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(b
 
 
 def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
-    """Scalars (count, runs) as given, and where that is NaN those that `sweep` leaves as they are, each run's own.
+    """Scalars (count, runs) as given, and where they are NaN the fixed point of `sweep`, separately for each run.
 
-    Alternating minimisation creeps, so this is Newton's method, from one sweep after START. Where a step leads astray
-    the sweep itself is taken; a run that has settled is left as it is. The last step is taken by all, outside the loop:
-    its derivative is that of the root, by the implicit function theorem, in reverse too.
+    Alternating minimisation converges slowly, so this is Newton's method, after one sweep from START. Where a Newton
+    step is too long the sweep itself is taken; a run that has converged is not changed. The last step is taken for all
+    runs, outside the loop: its derivative is that of the root, by the implicit function theorem, in reverse mode too.
     """
+    # No derivatives inside the loop.
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 
@@ -45,10 +46,12 @@ def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
         better = jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes))
         return jnp.where(moving(t, previous), better, t), t, sweeps + 1
 
+    # Newton's method on the logarithms, until every run has converged.
     first = jnp.log(jnp.where(free, START, given))
     first = jnp.broadcast_to(first, (len(given), *fixed[-1].shape))
     carry = first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)
     t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), again, carry)[0]
+    # One Newton step with derivatives: dt = (I - J)^-1 df.
     refined, slopes = sweep(t, *parts)
     return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
 
@@ -66,7 +69,7 @@ def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
 
 
 def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array) -> jax.Array:
-    """Omega of the gain for two scalars."""
+    """Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part."""
     return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
 
 
@@ -106,9 +109,9 @@ def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> 
 def _root_ratio(
     part: jax.Array, by_part: list[jax.Array], whole: jax.Array, by_whole: Sequence[jax.Array | None]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """log sqrt(part / whole), at least that of SMALLEST_SCALAR, which it is where nothing arrives and both are zero.
+    """log sqrt(part / whole), at least that of SMALLEST_SCALAR, also where nothing arrives and both are zero.
 
-    With its slopes from those of both. No quotient or root of zero is taken, so that there are derivatives.
+    Returned with its slopes, from those of both. No quotient or root of zero is taken, so that derivatives exist.
     """
     some = (part > 0) & (whole > 0)
     part, whole = jnp.where(some, part, 1.0), jnp.where(some, whole, 1.0)

@@ -1,4 +1,4 @@
-"""The central filter: it hears all nodes, predicts once, and uses their measurements one after another."""
+"""Central filter of several nodes: one prediction, then their measurements one after another."""
 
 from collections.abc import Sequence
 
@@ -36,17 +36,17 @@ class SequentialFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Belief:
-        """The first node's prior."""
+        """Return the first node's prior."""
         return self.filters[0].init()
 
     @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
-        """As the first node's filter does."""
+        """Predict with the first node's filter."""
         return self.filters[0].predict(state, u, k)
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
-        """Use what arrived from each node in turn."""
+        """Correct with each node's measurement in turn."""
         z = jnp.asarray(z)
         if all(alike(item, self.filters[0]) for item in self.filters):  # one correction compiled, run over the nodes
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
@@ -57,6 +57,7 @@ class SequentialFilter(AbstractFilter):
 
             state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
             return state, _joined([jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))])  # noqa: B023
+        # Filters of different structure: one correction each.
         ends, parts = np.cumsum([item.received for item in self.filters]), []
         for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
             state, single = item.correct(state, part, k)
@@ -65,14 +66,14 @@ class SequentialFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
-        """The belief, as the first node's filter tells it."""
+        """Mean and covariance of the belief, by the first node's filter."""
         estimate_ = self.filters[0].estimate(state)
         return Estimate(estimate_.mean, estimate_.covariance, self.claim)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
-        """The moments around all nodes' updates."""
+        """Return the moments around all nodes' updates."""
         item = self.filters[0]
         cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
         return moments_smoother_step(after, prior, cross, self.claim, first(item.plant).angles)
@@ -85,17 +86,19 @@ def _joined(parts: Sequence[Innovation]) -> Innovation:
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
-    """The central filter made of the nodes' own filters, in the order of the network's nodes.
+    """Central filter made of single nodes' `filters`, in the order of the network's nodes.
 
     Claim: "exact" if every part is, else "nominal".
 
     Raises:
         ValueError: no filters, or filters of different state dimensions.
+
     Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
     """
     parts = tuple(items("sequential filter", filters, "filters"))
     for item in parts:
         instance("sequential filter", item, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
+    # All estimate the same plant; the claim is that of the weakest filter.
     sizes = [(len(item.states), len(item.inputs)) for item in parts]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)

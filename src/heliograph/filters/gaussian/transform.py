@@ -32,17 +32,19 @@ class Transformed(NamedTuple):
 
 @readable
 class AbstractTransform(Module):
-    """A rule that carries a mean and a covariance through a function; every rule is exact for affine functions."""
+    """Rule that propagates a mean and a covariance through a function; every rule is exact for affine functions."""
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Moments of function(x) for x with the given mean (n,) and covariance (n, n)."""
+        """Moments of function(x) for x with mean (n,) and covariance (n, n)."""
         raise NotImplementedError
 
 
 class Cubature(AbstractTransform):
     """Third-degree spherical-radial cubature: 2 n points mean +- sqrt(n) L e_j with equal weights.
 
-    The mean is exact for polynomials of degree 3 of a Gaussian x, the covariance for degree 1.
+    The unscented transform with kappa = 0. The mean is exact for polynomials of degree 3 of a Gaussian x, the
+    covariance for degree 1.
+
     Source: Arasaratnam and Haykin, Cubature Kalman filters (2009), equations (30) to (36).
     """
 
@@ -93,19 +95,23 @@ def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Arr
 
 
 def linear_transform(matrix: Array, center: jax.Array, covariance: jax.Array) -> Transformed:
-    """Moments of a linear function with this matrix and this value at the mean: what every transform would find."""
+    """Moments of a linear function with this matrix and this value at the mean, which every transform reproduces."""
     return Transformed(center, *_linear_moments(covariance, jnp.asarray(matrix)))
 
 
 class PolynomialMoments(AbstractTransform):
     """Exact mean and covariance of a polynomial of a Gaussian x.
 
-    Degree 2 from the polynomial's own coefficients, 1 + 2 n + n (n - 1) / 2 evaluations. Other degrees d by
+    Degree 2 from the polynomial's coefficients, 1 + 2 n + n (n - 1) / 2 evaluations. Other degrees d by
     Gauss-Hermite quadrature: with d + 1 points in each of the n directions of the factor of P, products of two
     polynomials of degree d are integrated exactly; (d + 1)^n evaluations.
 
+    Args:
+        degree: of the polynomial, from 1.
+
     Raises:
         ValueError: a degree below one, or (when applied) more than 20,000 points.
+
     Source: Golub and Welsch, Calculation of Gauss quadrature rules (1969).
     """
 
@@ -115,7 +121,7 @@ class PolynomialMoments(AbstractTransform):
         self.degree = check_count("degree of the polynomial", degree)
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Read off the coefficients, or evaluate at the quadrature points and sum with their weights."""
+        """Compute the coefficients, or evaluate at the quadrature points and sum with their weights."""
         if self.degree == 2:
             factor = cholesky(covariance)
             return _quadratic_moments(

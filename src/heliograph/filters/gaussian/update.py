@@ -1,6 +1,6 @@
-"""Measurement updates that know the channel: the gain that minimises a bound on the error covariance, and the bound.
+"""Measurement updates behind an uncertain channel: the gain that minimises a bound on the error covariance.
 
-Notation inside: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n what arrives,
+Notation inside: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the measurement,
 M = E[G] nominal, D_v = E_v[G] - M the shift under a possible law v.
 """
 
@@ -36,23 +36,24 @@ from heliograph.random_affine.moments.second_moments import (
 
 @readable
 class AbstractUpdate(Module):
-    """How a channel's uncertainty is bounded, and the gain that minimises the bound."""
+    """Rule for bounding the effect of a channel's uncertainty, with the gain that minimises the bound."""
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """The channel's mean gain and its worst cases, computed once before any data."""
+        """Return the channel's mean gain and its worst cases, computed once before any data."""
         raise NotImplementedError
 
     def described(self) -> "AbstractUpdate":
-        """What corrects once the channel is described: updates that differ in the description alone share it.
+        """Return the update that corrects once the channel is described.
 
-        Filters with one and the same correction share a compiled program.
+        Updates that differ in the description alone share it, so that filters with one correction share a compiled
+        program.
         """
         return self
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Gain K (n, m) and bound (n, n) after the update; the columns of absent components are zero."""
+        """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero."""
         raise NotImplementedError
 
 
@@ -60,10 +61,15 @@ class Polytope(AbstractUpdate):
     """Bound by Young's inequality over the exact worst case of the uncertain probabilities.
 
     e+ = e - K M e_y - K D_v y - K (zero mean given y) and, for every beta_1, beta_2 > 0,
+
     E[e+ e+'] <= (1 + beta_1) P - K M Pyx - (.)' + K Omega K', with
     Omega = spread(Y) + (1/beta_1 + 1/beta_2) shift(Y) + (1 + beta_2) M Pyy M'.
+
     No assumption on E[e y'] beyond Pxy. Where the law is known shift = 0, both scalars are 0 and the bound is the
-    covariance itself. `scalars` None: the trace is minimised over them at each step.
+    covariance itself.
+
+    Args:
+        scalars: beta_1 and beta_2; None, the default, minimises the trace over them at each step.
 
     Source: cubature fusion under amplify-and-forward relays, Theorems 1 and 2, with the worst cases taken exactly.
     """
@@ -74,7 +80,7 @@ class Polytope(AbstractUpdate):
         self.scalars = as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases over the polytope."""
+        """Worst cases over the polytope of possible laws."""
         return second_order(channel)
 
     def correct(
@@ -85,13 +91,18 @@ class Polytope(AbstractUpdate):
 
 
 class ZeroMean(AbstractUpdate):
-    """A tighter bound that trusts the filter's premise E[e | data] = 0, hence E[e yhat'] = 0.
+    """Tighter bound under the filter's premise E[e | data] = 0, hence E[e yhat'] = 0.
 
     Then only e_y, not all of y, is correlated with e:
+
     E[e+ e+'] <= P + beta Pxy Pyy^-1 Pyx - K M Pyx - (.)' + K Omega K',
     Omega = power(Pyy) + shift(Pyy) / beta + spread(yhat yhat').
 
-    `scalar` None: the trace is minimised over beta at each step.
+    Args:
+        scalar: beta > 0; None, the default, minimises the trace over beta at each step.
+
+    Raises:
+        ValueError: a scalar that is not positive.
     """
 
     scalar: np.ndarray
@@ -102,7 +113,7 @@ class ZeroMean(AbstractUpdate):
             raise fail("scalar of the bound", "a positive number", scalar)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases over the polytope."""
+        """Worst cases over the polytope of possible laws."""
         return second_order(channel)
 
     def correct(
@@ -117,6 +128,9 @@ class Interval(AbstractUpdate):
 
     With m, s = E g, E g^2 and radii r = sum |v_i| radius_i, q = sum v_i^2 radius_i of each hop:
     var g <= s + q - max(|m| - r, 0)^2. Sound, looser than `Polytope`, and for chains of scalar hops only.
+
+    Args:
+        scalars: beta_1 and beta_2 as in `Polytope`; None, the default, minimises the trace over them at each step.
 
     Source: cubature fusion under amplify-and-forward relays, equation (11), with the sign of its last term corrected.
     """
@@ -146,7 +160,7 @@ class Interval(AbstractUpdate):
 
 
 class HopRange(NamedTuple):
-    """One hop's amplitude, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
+    """Amplitude of one hop, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
 
     amplitude: float
     mean: float
@@ -173,17 +187,19 @@ def _is_scalar(matrix: jax.Array | np.ndarray) -> bool:
 def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
     """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
 
-    `variance` says how large var g of a hop is taken to be.
+    `variance` is the bound on var g of a hop.
 
     Raises:
         ValueError: a channel that is not a chain of scalar hops.
     """
     hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
+    # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:
         spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
         power *= hop.second
         noise = hop.amplitude**2 * hop.second * noise + hop.noise
+    # Shift of the mean gain: prod (|m| + r) - prod |m|.
     amplitude = float(np.prod([hop.amplitude for hop in hops]))
     nominal = float(np.prod([abs(hop.mean) for hop in hops]))
     shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal

@@ -1,8 +1,8 @@
-"""What a polynomial filter takes off before it multiplies: the mean of the state, and what it sends, without any data.
+"""Centring for polynomial filters: the mean of the state, and of what is received, before any data.
 
-Powers of numbers far from zero are alike: of x near 10,000 with a spread of 1, the squares and x itself agree to nine
-digits, and what the squares would add is in those that are lost. A known gain sends the mean to a known place, so that
-z - G C E[x_k] hears x_k - E[x_k] alone, and all moments are about the mean.
+Powers of numbers far from zero are nearly collinear: of x near 10,000 with a spread of 1, the squares and x itself
+agree to nine digits, and what the squares would add is in the digits that are lost. Behind a known gain, the
+measurement can be centred: z - G C E[x_k] depends on x_k - E[x_k] alone, and all moments are about the mean.
 """
 
 from typing import TypeVar
@@ -25,9 +25,9 @@ T = TypeVar("T")
 
 
 class Centre(Module):
-    """E[x_0], and E[x+] = A E[x] + b, of which G C E[x+] arrives; each at every step, or the same throughout.
+    """Mean of the state before any data, E[x_0] and E[x+] = A E[x] + b, and the matrix G C with which it is received.
 
-    Shapes: start (n,), transition (n, n), drift (n,), heard (m, n).
+    Shapes: start (n,), transition A (n, n), drift b (n,), received G C (m, n); each at every step, or constant.
     """
 
     start: Float[Array, " n"]
@@ -37,7 +37,7 @@ class Centre(Module):
 
 
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
-    """The mean of a linear model's state; None where it is zero throughout or a gain is random."""
+    """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
     plants, sensors, channels = _over_steps(plant), _over_steps(sensor), _over_steps(channel)
     if not all(has_known_gain(c) for c in channels):
         return None
@@ -52,7 +52,7 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
 
 
 def without_mean(plant: AnyPlant) -> AnyPlant:
-    """The plant of x_k - E[x_k]."""
+    """Return the plant of the centred state x_k - E[x_k]."""
     if isinstance(plant, OverTime):
         return over_time([without_mean(item) for item in unstack(plant)])
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)

@@ -1,4 +1,4 @@
-"""The best linear filter behind a random channel that draws anew at each step, and the way to the others."""
+"""Best linear filter behind a random channel with independent draws, and the choice among the others."""
 
 from dataclasses import replace
 from functools import partial
@@ -38,7 +38,10 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, has_kno
 
 
 class LinearBelief(NamedTuple):
-    """The estimate's mean and error covariance, and the state's own mean and covariance before any data."""
+    """Posterior mean and error covariance, and the state's mean and covariance before any data.
+
+    Shapes: mean, state_mean (n,); covariance, state_covariance (n, n).
+    """
 
     mean: Float[jax.Array, " n"]
     covariance: Float[jax.Array, "n n"]
@@ -47,14 +50,21 @@ class LinearBelief(NamedTuple):
 
 
 class LinearFilter(AbstractFilter):
-    """The linear minimum-mean-square-error filter of a linear plant behind a random affine channel.
+    """The linear minimum-mean-square-error filter of a linear plant behind a random affine channel z = G y + n.
 
-    With G random, the innovation covariance needs E[y y'] = C E[x x'] C' + R, which is propagated before any data
-    instead of being read off the estimate. Then the claim is exact; where probabilities are uncertain, an upper bound.
+    With y = C x + v, M = E[G] and Y = E[y y'] = C E[x x'] C' + R:
+
+        S = M (C P- C' + R) M' + E[(G - M) Y (G - M)'] + Cov n     innovation covariance
+        K = P- C' M' S^-1,  m = m- + K (z - M (C m- + E v) - E n),  P = P- - K S K'
+
+    The middle term of S is what an ordinary Kalman filter lacks: the random gain multiplies the whole signal, not only
+    its unknown part. Y is propagated from the state's moments before any data instead of being taken from the estimate.
+    Then the claim is exact; where probabilities are uncertain, an upper bound.
+
     The innovation has the nominal law's covariance; it is not Gaussian, so its Gaussian likelihood is nominal.
 
-    `mean_known`: E[G] is. Given later data too the claim is then the filter's: with the gains fixed, what dominates
-    each step's noise dominates the error. With E[G] uncertain nothing is proved of it, and it is nominal.
+    `mean_known`: whether E[G] is known. If so, the claim of smoothed estimates is that of the filter: with the gains
+    fixed, what dominates each step's noise dominates the error. Otherwise it is nominal.
 
     Source: De Koning, Optimal estimation of linear discrete-time systems with stochastic parameters (1984).
     """
@@ -71,14 +81,14 @@ class LinearFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> LinearBelief:
-        """The prior, as estimate and as state."""
+        """Return the prior, both as estimate and as the state's moments before data."""
         start = at(self.plant, 0)
         mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
         return LinearBelief(mean, spread, mean, spread)
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
-        """Both moments over step k."""
+        """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
         error, local = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
@@ -86,10 +96,12 @@ class LinearFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
-        """Use what arrived of z."""
+        """Correct with the components of z that arrived."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        # Moments of the signal: the innovation part C P C' + R, and E[y y'] before any data.
         y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
+        # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
         start = at(self.plant, 0)
         size = initial_size(start.initial_mean, start.initial_covariance)
@@ -110,7 +122,7 @@ class LinearFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: LinearBelief) -> Estimate:
-        """The estimate's mean and covariance."""
+        """Mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(
@@ -123,7 +135,7 @@ class LinearFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """The update itself, or the moments around it where E[G] is uncertain."""
+        """Return the linear update itself, or the moments around it where E[G] is uncertain."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         transition = jnp.asarray(at(self.plant, k).matrix)
         if not self.mean_known:
@@ -133,12 +145,13 @@ class LinearFilter(AbstractFilter):
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
             y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
             total = known_gain_covariance(y, channel, ~jnp.isnan(z))
+        # F = A, H = M C, process noise Q.
         output = observed_through(channel.mean_gain, sensor.matrix)
         process = at(self.plant, k).noise_covariance(jnp.asarray(u))
         return linear_smoother_step(after, prior, transition, process, output, innovation.value, total, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before."""
+        """Precompute all covariances and gains."""
         return plan(self, inputs)
 
 
@@ -167,10 +180,10 @@ def _clipped(a: jax.Array, largest: float) -> jax.Array:
 def signal(
     known: tuple[jax.Array, jax.Array, jax.Array], c: jax.Array, noise_mean: jax.Array, noise: jax.Array
 ) -> Signal:
-    """y = C x + v: its mean before any data, the covariance of what is not known of it, E[y y'].
+    """Moments of y = C x + v: mean before any data, covariance C P C' + R, and E[y y'].
 
-    Of what is known before data alone, error covariance and the state's own moments: derivatives with respect to the
-    estimate pass it by.
+    They depend only on the error covariance and on the state's moments before data, not on the estimate: derivatives
+    with respect to the estimate do not involve them.
     """
     covariance, state_mean, state_covariance = known
     cross = times(covariance, transpose(c))
@@ -191,7 +204,7 @@ def used(
     channel_offset: jax.Array,
     z: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean and covariance after z, and what was expected, M (C m + v) + b."""
+    """Posterior mean and covariance given z, and the expected measurement M (C m + v) + b."""
     present = ~jnp.isnan(z)
     expected = times_vector(channel_gain, times_vector(c, mean) + noise_mean) + channel_offset
     after = mean + times_vector(gain, jnp.where(present, z - expected, 0.0))
@@ -201,21 +214,31 @@ def used(
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
-    """The best linear filter for a linear plant and sensor behind any channel.
+    """Best linear filter for a linear plant and sensor behind any channel.
 
-    Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
-    too; if it also loses data, what arrives tells of the modes (`side_information_filter`). Behind a link that is
-    late what was sent is estimated too, unless the delay is constant. A sensor noise correlated with its own past is
-    outside.
+    Behind links with memory the modes are estimated jointly; if such a channel also loses data, what arrives is used as
+    information on the modes (`side_information_filter`). Behind a late link the past signals are estimated jointly,
+    unless the delay is constant.
+
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs, with white noise.
+        channel: from the sensor to the filter.
+        update: how uncertain probabilities are bounded; `Polytope()` by default, none behind links with memory.
+
+    Claim: "exact"; "upper" where probabilities are uncertain.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
+
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
+    # Delays: the same filter for the system enlarged by past signals.
     if as_maps("channel", [first(channel)])[0].past:
         return behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
     check_linear("linear filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
+    # Memory: the modes are estimated jointly with the state.
     if first(channel).remembers:
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
@@ -224,6 +247,7 @@ def linear_filter(
         if uncertain_chain(channel):
             return uncertain_modal_filter(plant, sensor, channel)
         return modal_filter(plant, sensor, channel)
+    # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe(channel, rule)
     whole = described.values if isinstance(described, OverTime) else described
@@ -244,31 +268,45 @@ def linear_filter(
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> LinearFilter:
-    """The best linear filter for links that draw anew at each step, behind links that may remember.
+    """Best linear filter for links with independent draws, behind links that may have memory.
 
-    Claim: as `linear_filter` of links that forget, lowered to "nominal" where memory matters (`memory_matters`);
-    `true_error` says before any data by how much it is wrong then.
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter; its memory is ignored.
+        update: how uncertain probabilities are bounded; `Polytope()` by default.
+
+    Claim: as `linear_filter` for links without memory, lowered to "nominal" where memory matters (`memory_matters`);
+    `true_error` computes the error that results, before any data.
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, losses.
+
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
     item = linear_filter(plant, sensor, without_memory(channel), update)
-    assert isinstance(item, LinearFilter)  # what does not remember has no other
+    assert isinstance(item, LinearFilter)  # a channel without memory has no other
     return replace(item, claim="nominal") if memory_matters(channel) else item
 
 
 def as_current_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> LinearFilter:
-    """The filter that takes what is late as current: the best linear one if all delays were none.
+    """Filter that takes delayed signals as current: the best linear filter if all delays were zero.
 
-    Claim: "nominal" where anything can be late; `true_error` says before any data how wrong it is then.
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter; its delays and memory are ignored.
+        update: how uncertain probabilities are bounded; `Polytope()` by default.
+
+    Claim: "nominal" where anything can be late; `true_error` computes the error that results, before any data.
 
     Raises:
         ValueError: what `linear_filter` refuses, losses.
+
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
     item = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
-    assert isinstance(item, LinearFilter)  # what is neither late nor remembers has no other
+    assert isinstance(item, LinearFilter)  # a channel without delay or memory has no other
     return replace(item, claim="nominal") if first(channel).past else item

@@ -1,4 +1,4 @@
-"""The filter that hears nothing: prediction only."""
+"""Prediction without measurements."""
 
 import jax.numpy as jnp
 
@@ -11,34 +11,42 @@ from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 
 class OpenLoop(AbstractBeliefFilter):
-    """The filter that hears nothing: prediction only. What any use of the measurements has to beat."""
+    """Prediction without measurements: the baseline for any use of them."""
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
-        """z, of whatever length, is not used."""
+        """Return the state as it is, whatever the length of z."""
         return state, no_innovation()
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
-        """The prediction, of which nothing more is ever heard."""
+        """Return the prediction as a smoother step, with no measurement after it."""
         cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
         return moments_smoother_step(after, prior, cross, self.claim, first(self.plant).angles)
 
 
 def open_loop_filter(
-    plant: AnyPlant, initial_mean: ArrayLike | None = None, initial_covariance: ArrayLike | None = None
+    plant: AnyPlant,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> OpenLoop:
     """Prediction by cubature points without any measurement.
 
-    Claim: "exact" for a linear plant started from its own initial law, else "nominal".
+    Args:
+        plant: the plant, n states.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "exact" for a linear plant started from its initial law, else "nominal".
 
     Raises:
         ValueError: an initial mean or covariance of the wrong shape.
+
     Source: the prediction step of any of the filters, alone.
     """
     start = check_plant(plant)

@@ -1,4 +1,4 @@
-"""A linear filter computed before any data: where nothing but its mean depends on what arrives."""
+"""Precomputed linear filters: gains and covariances for each step, where nothing but the mean depends on data."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -21,7 +21,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 
 class Plan(NamedTuple):
-    """One step: m- = F m + f, m = m- + K (z - C m- - c), with the innovation's covariance S for complete data.
+    """Matrices of one step: m- = F m + f, m = m- + K (z - C m- - c), with innovation covariance S for complete data.
 
     Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m).
     """
@@ -35,7 +35,7 @@ class Plan(NamedTuple):
 
 
 class PlannedMean(NamedTuple):
-    """The mean (N,), and the place of its covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k."""
+    """Mean (N,), and the index of its covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k."""
 
     mean: Float[jax.Array, " N"]
     stage: Int[jax.Array, ""]
@@ -44,12 +44,13 @@ class PlannedMean(NamedTuple):
 class PlannedFilter(AbstractFilter):
     """A filter whose gains and covariances are known for each step; only the mean is left to compute.
 
-    For the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built by
-    `planned` of a filter whose gains do not depend on data.
+    Valid for the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built
+    by `planned` of a filter whose gains do not depend on data.
 
-    `past`: what each step retains for a sweep back, all of it that no data change; None where nobody asks for one.
+    `past`: the smoother steps without their data; None if the filter is not smoothed.
 
-    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); xhat = want m.
+    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); projection (n, N), with
+    xhat = projection m.
     """
 
     steps: OverTime
@@ -64,7 +65,7 @@ class PlannedFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> PlannedMean:
-        """The mean at the start."""
+        """Return the initial mean."""
         return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
 
     @predicts
@@ -83,11 +84,11 @@ class PlannedFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: PlannedMean) -> Estimate:
-        """The mean, with the covariance that was planned."""
+        """Mean of the state, with the planned covariance."""
         return self._estimate(state.mean, state.stage)
 
     def after_step(self, state: PlannedMean, k: Step) -> Estimate:
-        """The same, its place taken from the step: it is then common to all runs."""
+        """Mean of the state, with the planned covariance of step k, common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(
@@ -100,7 +101,7 @@ class PlannedFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """What was planned, with the mean and the innovation of these data."""
+        """Return the planned smoother step with the mean and the innovation of these data."""
         if self.past is None:
             return super().smoother_step(before, prior, after, innovation_, z, u, k)
         p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
@@ -108,7 +109,7 @@ class PlannedFilter(AbstractFilter):
         return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
 
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
-        """With what the steps retained, whatever the data were."""
+        """Return the filter with smoother steps, which are the same for all data."""
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
@@ -128,9 +129,10 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
 def plan(
     item: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
-    """Follow a filter over complete data and read its matrices off it; its state has a `mean` and a `covariance`.
+    """Run a filter over complete data and record its matrices; its state has a `mean` and a `covariance`.
 
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
+    `projection` (n, N) maps the filter's mean to the plant's states.
 
     Raises:
         ValueError: inputs of another number than the filter's.
@@ -140,6 +142,7 @@ def plan(
 
 @compiled
 def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+    # Complete data of zeros: the matrices do not depend on their values.
     quiet = jnp.zeros(item.received)
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
@@ -149,6 +152,7 @@ def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> Plan
     start = item.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
+    # Covariances in the order of `PlannedMean.stage`.
     items = covariances.reshape(-1, *covariances.shape[2:])
     known = jnp.concatenate([_seen(start.covariance, projection)[None], items])
     return PlannedFilter(
@@ -164,7 +168,8 @@ def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> Plan
 
 
 def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
-    """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    # F and f: the prior mean is affine in the mean.
     none = jnp.zeros_like(state.mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
@@ -172,6 +177,7 @@ def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k:
         return jnp.asarray(prior.mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
+    # K and C: derivatives of posterior mean and innovation.
     (_, gain), (output, _), after, innovation = _corrected(item, prior, none, z, k)
     single = Plan(
         transition=transition,
@@ -198,7 +204,7 @@ def _corrected(
 
 
 def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
-    """The matrices of one step of a filter of which only the mean depends on data; of z only what is missing counts.
+    """Matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
@@ -215,7 +221,7 @@ def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array,
 
 
 class Linearised(NamedTuple):
-    """One step of a filter along its own estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
+    """One step of a filter linearised at its estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
 
     Shapes: predicted m- (n,), gain K (n, m), output C (m, n), noise S (m, m); zero for what did not arrive.
     """
@@ -227,7 +233,7 @@ class Linearised(NamedTuple):
 
 
 def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
-    """The derivatives of a filter's own correction at its prediction, with its covariance held.
+    """Linearise a filter's correction at its prediction, with its covariance held.
 
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
     """
@@ -240,7 +246,7 @@ def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Ar
 
 
 def is_linear_filter(item: AbstractFilter) -> bool:
-    """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
+    """Test whether only the mean of the filter depends on data, and estimates the plant's state alone."""
     leaves, tree = jax.tree.flatten(item)
     return _is_linear(tree, tuple(map(_shape, leaves)))
 
@@ -253,7 +259,7 @@ def _shape(leaf: Any) -> object:
 
 @lru_cache(maxsize=1024)
 def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
-    """What numbers have no part in, so that filters of one structure are traced once."""
+    """Answer of `is_linear_filter` by structure and shapes, so that filters of one structure are traced once."""
     with jax.enable_x64(True):
         item = jax.tree.unflatten(tree, leaves)
         planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), item)

@@ -1,4 +1,4 @@
-"""Filters that use powers and products of what they hear: a lift of the measurement before a linear filter."""
+"""Filters of powers and products of the measurement: a lift of z before a linear filter."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -31,22 +31,26 @@ from heliograph.random_affine.moments.monomials import count, monomials, positio
 
 
 class Centred(NamedTuple):
-    """The inner filter's state, and the mean (n,) of x that it does not see."""
+    """State of the inner filter, and the mean (n,) of x that is subtracted before it."""
 
     inner: PyTree
     mean: Float[Array, " n"]
 
 
 class PolynomialFilter(AbstractFilter):
-    """Give a filter all monomials of z up to `degree` in place of z; with a component, every monomial of it is missing.
+    """Filter of all monomials of z up to `degree`; a missing component makes each of its monomials missing.
 
-    `inner` is a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system. The innovation is that of z itself,
-    among its monomials, with its exact covariance; the log-likelihood is Gaussian with it. `endless`: the last step's
-    matrices hold for ever, so that it may go on beyond them. `centre`: what is taken off z, and added to the estimate,
-    of an inner filter that knows x - E[x] only.
+    The innovation is that of z itself, among its monomials, with its exact covariance; the log-likelihood is Gaussian
+    with it.
+
+    Args:
+        inner: a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system.
+        degree: of the monomials.
+        endless: whether the last step's matrices hold for all later steps; False by default.
+        centre: what is subtracted from z, and added to the estimate, for an inner filter of x - E[x]; None by default.
 
     Raises:
-        ValueError: an inner filter that hears no such monomials.
+        ValueError: an inner filter whose measurement is no such vector of monomials.
     """
 
     inner: AbstractFilter
@@ -71,18 +75,18 @@ class PolynomialFilter(AbstractFilter):
 
     @property
     def horizon(self) -> int | None:
-        """The inner filter's, unless its last matrices hold for ever."""
+        """Horizon of the inner filter; None where its last matrices hold for all later steps."""
         return None if self.endless else self.inner.horizon
 
     @in_float64
     def init(self) -> PyTree:
-        """The inner filter's state, and the mean that it does not see."""
+        """Return the inner filter's state, and the mean that is subtracted before it."""
         start = np.zeros(len(self.states)) if self.centre is None else self.centre.start
         return Centred(self.inner.init(), jnp.asarray(start))
 
     @predicts
     def predict(self, state: Centred, u: ArrayLike = (), k: Step = 0) -> Centred:
-        """The inner filter's prediction."""
+        """Predict with the inner filter, and move the mean."""
         inner = self.inner.predict(state.inner, u, k)
         if self.centre is None:
             return Centred(inner, state.mean)
@@ -99,11 +103,11 @@ class PolynomialFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Centred) -> Estimate:
-        """The inner filter's, about the mean."""
+        """Estimate of the inner filter, plus the mean."""
         return _moved(self.inner.estimate(state.inner), state.mean)
 
     def after_step(self, state: Centred, k: Step) -> Estimate:
-        """The inner filter's, about the mean."""
+        """Estimate of the inner filter after step k, plus the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(
@@ -116,18 +120,18 @@ class PolynomialFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """The inner filter's, on the lifted system, about the mean."""
+        """Return the smoother step of the lifted system, about the mean."""
         z = jnp.asarray(z)
         z = z if self.centre is None else z - at(self.centre, k).received @ prior.mean
         inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
         return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """The inner filter planned."""
+        """Precompute the inner filter."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
-        """The inner filter with what the steps retained."""
+        """Return the filter with the smoother steps of its inner filter."""
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
@@ -136,7 +140,7 @@ def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
 
 
 def _of_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
-    """The part of a lifted innovation that is z itself."""
+    """Innovation of z itself, out of that of its monomials."""
     m, places = len(z), position(len(z) + 1, degree)
     values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
     value, covariance = innovation.value[values], innovation.covariance[values][:, values]
@@ -146,19 +150,27 @@ def _of_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -
 def polynomial_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
 ) -> PolynomialFilter:
-    """The best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
+    """Best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
 
     For linear plants and sensors behind any channel, with noises of any law whose moments up to 2 degree exist. It
     estimates the whole state, a dynamical bias included, and its covariance is recomputed where z has gaps. For many
-    complete runs `scheduled_polynomial_filter` does the same with saved gains.
+    complete runs `scheduled_polynomial_filter` does the same with saved gains. Behind a known gain all moments are
+    about the mean.
 
-    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are trusted), or where rounding is
-    more than 1e-6 of a claimed variance, with a warning: behind a random gain, far from zero. Behind a known gain all
-    moments are about the mean. Covers `horizon` steps; a stream may go on beyond them where nothing varies over time
-    and the matrices have settled by then.
+    Args:
+        plant: a linear plant without inputs, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter.
+        horizon: number of steps; a stream may go on beyond them where nothing varies over time and the matrices have
+            reached a steady state by then.
+        degree: of the polynomial in z_k; 2 by default.
+
+    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are used), or where rounding is more
+    than 1e-6 of a claimed variance, with a warning: behind a random gain, far from zero.
 
     Raises:
         ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
+
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
@@ -170,7 +182,7 @@ def polynomial_filter(
 def _lifted(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[Centre | None, LinearSystem]:
-    """The lift of the model about its mean, where the gain is known."""
+    """Lifted system of the model, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
     centre = centre_of(plant, sensor, channel)
     about = plant if centre is None else without_mean(plant)
@@ -178,7 +190,7 @@ def _lifted(
 
 
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
-    """Whether a model that does not vary has come to matrices that do not change any more, to rounding."""
+    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding."""
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
     return all(np.allclose(part[-1], part[-2], rtol=1e-12, atol=0) for part in system.steps)
@@ -187,10 +199,20 @@ def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: Lin
 def scheduled_polynomial_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
 ) -> PolynomialFilter:
-    """`polynomial_filter` with saved gains, for complete data: the same estimates at a fraction of the cost per step.
+    """Polynomial filter with saved gains: for complete data, as `polynomial_filter` at a fraction of the cost per step.
+
+    Args:
+        plant: a linear plant without inputs, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter.
+        horizon: number of steps.
+        degree: of the polynomial in z_k; 2 by default.
+
+    Claim: as `polynomial_filter`.
 
     Raises:
         ValueError: what `polynomial_filter` refuses.
+
     Source: as `polynomial_filter`.
     """
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
@@ -199,16 +221,17 @@ def scheduled_polynomial_filter(
 
 
 class MemoryState(NamedTuple):
-    """States of the linear filter and of the filter of the products."""
+    """States of the linear filter and of the filter of products."""
 
     linear: ScheduleState
     products: ScheduleState
 
 
 class MemoryFilter(AbstractFilter):
-    """The quadratic filter with memory: it hears z, its squares, and the products of z and the linear estimate.
+    """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
 
-    With saved gains, for complete data; see `ScheduledFilter` for what gaps do, `PolynomialFilter` for the innovation.
+    With saved gains, for complete data; see `ScheduledFilter` for the effect of gaps, `PolynomialFilter` for the
+    innovation.
     """
 
     linear: ScheduledFilter
@@ -224,12 +247,12 @@ class MemoryFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> MemoryState:
-        """Both filters' starts."""
+        """Return the initial states of both filters."""
         return MemoryState(self.linear.init(), self.products.init())
 
     @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
-        """Both filters' predictions."""
+        """Predict with both filters."""
         return MemoryState(self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k))
 
     @corrects
@@ -243,25 +266,33 @@ class MemoryFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: MemoryState) -> Estimate:
-        """The filter of the products'."""
+        """Estimate of the filter of products."""
         return self.products.estimate(state.products)
 
     def after_step(self, state: MemoryState, k: Step) -> Estimate:
-        """The filter of the products'."""
+        """Estimate of the filter of products after step k."""
         return self.products.after_step(state.products, k)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
-    """The quadratic filter whose products reach into the past through the linear filter's estimate.
+    """Quadratic filter whose products reach into the past through the linear filter's estimate.
+
+    Args:
+        plant: a linear plant without inputs, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter, without memory.
+        horizon: number of steps.
 
     Claim: as `polynomial_filter`; never worse than its quadratic filter.
 
     Raises:
-        ValueError: what `polynomial_filter` refuses; a channel that remembers.
+        ValueError: what `polynomial_filter` refuses; a channel with memory.
+
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
     check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
     claim = claim_of(channel)
+    # The linear filter's gains are needed for the moments of its products with z.
     linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
     products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)
     names = first(plant).states

@@ -1,4 +1,4 @@
-"""Filters whose gains were computed before any data, and the same recursion on-line for data with gaps."""
+"""Filters with gains computed before any data, and the same recursion on-line for data with gaps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,9 +27,9 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
 class ScheduleState(NamedTuple):
-    """The schedule's state (N,), the estimate's mean (q,), what is expected next (m,), and whether all has arrived.
+    """Schedule's state (N,), the estimate's mean (q,), the expected measurement (m,), and whether all has arrived.
 
-    `stage` is the place of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
+    `stage` is the index of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
     """
 
     value: Float[jax.Array, " N"]
@@ -40,13 +40,17 @@ class ScheduleState(NamedTuple):
 
 
 class ScheduledFilter(AbstractFilter):
-    """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d. A step costs a few products of a matrix and a vector.
+    """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d, a few products of a matrix and a vector per step.
 
-    Predicted is what follows if what the schedule expects arrives, e = G s + g; a correction adds K (z - e) and
-    J (z - e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not
-    arrive counts as what the filter expected, and from then on the covariance is NaN: none is known any more, and the
-    record says so; what no gain of the step uses cannot be missed (a planned silence). Where data have gaps, use
+    The prediction assumes that the expected measurement arrives, e = G s + g; a correction adds K (z - e) and J (z -
+    e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not arrive
+    counts as if it equalled its expectation, and from then on the covariance is NaN: it is not known any more, and the
+    record says so; a component with zero gain cannot be missed (a planned silence). Where data have gaps, use
     `LinearSystemFilter`, which recomputes its gains. Before its first prediction a schedule estimates nothing (NaN).
+
+    Args:
+        schedule: gains and covariances for each step.
+        states: names of the states; x0, x1, ... by default.
 
     Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
     """
@@ -71,13 +75,13 @@ class ScheduledFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ScheduleState:
-        """The schedule's start."""
+        """Return the schedule's initial state."""
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(jnp.asarray(self.start), mean, expected, jnp.asarray(True), jnp.asarray(0))
 
     @predicts
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
-        """What follows if what is expected arrives."""
+        """Predict as if the expected measurement arrived."""
         g: Gains = at(self.gains, k)
         s = state.value
         return ScheduleState(
@@ -90,7 +94,7 @@ class ScheduledFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
-        """Add what was not expected, times the gains of step k."""
+        """Add the innovation times the gains of step k."""
         g: Gains = at(self.gains, k)
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
@@ -107,11 +111,11 @@ class ScheduledFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: ScheduleState) -> Estimate:
-        """The estimate's mean, with the schedule's covariance while all has arrived."""
+        """Mean of the estimate, with the schedule's covariance while all has arrived."""
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
-        """The same, its place taken from the step: it is then common to all runs."""
+        """Estimate after step k, with the covariance of that step, common to all runs."""
         return self._estimate(state, 2 * k + 2)
 
     def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
@@ -120,7 +124,7 @@ class ScheduledFilter(AbstractFilter):
 
 
 def _if_expected(g: Gains) -> Gains:
-    """The gains with e = G s + g in place of z: (F + K G) s + c + K g, (L + J G) s + d + J g."""
+    """Gains with e = G s + g in place of z: (F + K G) s + c + K g, (L + J G) s + d + J g."""
     return g._replace(
         transition=g.transition + g.gain @ g.expected,
         offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
@@ -130,10 +134,15 @@ def _if_expected(g: Gains) -> Gains:
 
 
 class LinearSystemFilter(AbstractFilter):
-    """The best linear filter of a linear system, with its covariance carried along: exact also for data with gaps.
+    """The best linear filter of a linear system, with its covariance propagated: exact also for data with gaps.
 
     A component of z that did not arrive is left out of the step, as if that channel were off. Which components arrive
     must not depend on their values.
+
+    Args:
+        system: matrices and noise covariances of each step.
+        claim: what the covariance is; "exact" by default.
+        states: names of the states; x0, x1, ... by default.
     """
 
     steps: OverTime
@@ -155,7 +164,7 @@ class LinearSystemFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Belief:
-        """The system's start."""
+        """Return the system's initial belief."""
         return Belief(jnp.asarray(self.mean), jnp.asarray(self.covariance))
 
     @predicts
@@ -166,14 +175,16 @@ class LinearSystemFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
-        """Use what arrived of z."""
+        """Correct with the components of z that arrived."""
         s: Steps = at(self.steps, k)
         z, (mean, spread) = jnp.asarray(z), state
         present = ~jnp.isnan(z)
+        # Innovation covariance S = C P C' + R, zero rows for absent components.
         expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
         observed, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
         used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
+        # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
         after = Belief(
             mean + solved.T @ jnp.where(present, z - expected, 0.0),
@@ -183,14 +194,14 @@ class LinearSystemFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
-        """What is to be known of the belief."""
+        """Mean and covariance of the plant's states, by the projection."""
         projection = jnp.asarray(self.projection)
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation_: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
-        """The update itself."""
+        """Return the linear update."""
         s: Steps = at(self.steps, k)
         innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
         total = s.output @ prior.covariance @ s.output.T + s.noise
@@ -208,7 +219,7 @@ class LinearSystemFilter(AbstractFilter):
         )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before."""
+        """Precompute all covariances and gains."""
         return plan(self, inputs, self.projection)
 
 

@@ -1,4 +1,4 @@
-"""The true error of a filter whose gains depend on no data, before any data: whatever the filter believes."""
+"""True error covariance of a filter whose gains do not depend on data, in a world that may differ from its model."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,13 @@ from heliograph.numerics.types import ArrayLike, Float
 @readable
 @dataclass(frozen=True)
 class TrueError:
-    """What a filter claims of its error, and what it is: both (time, n, n), after each correction."""
+    """Claimed and true error covariance of a filter after each correction.
+
+    Args:
+        states: names of the states.
+        claimed: covariance that the filter claims (time, n, n).
+        true: E[(x - xhat)(x - xhat)'] (time, n, n).
+    """
 
     states: tuple[str, ...]
     claimed: Float[np.ndarray, "time n n"]
@@ -41,40 +47,52 @@ def true_error(
     sensor: AnySensor,
     channel: Channel,
     horizon: int,
-    inputs: ArrayLike | None = None,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> TrueError:
-    """E[(x - xhat)(x - xhat)'] of a linear filter in a world that it need not have been made for, exactly.
+    """E[(x - xhat)(x - xhat)'] of a linear filter in a world that may differ from its model, exactly.
 
     With r = (x, 1, s), s the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and gains.
-    The channel may remember or not, or be late, and nothing is assumed of where the gains come from.
+    Nothing is assumed about the origin of the gains.
 
-    Shapes: inputs (horizon, inputs).
+    Args:
+        filter: a filter whose gains do not depend on data.
+        plant: the true plant, linear.
+        sensor: the true sensor, linear.
+        channel: the true channel, with or without memory or delays, without losses.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); zero inputs of width 0 by default.
 
     Raises:
         ValueError: a filter whose gains depend on data, a plant or sensor that is not linear, parts that do not fit, a
             channel that loses data.
+
     Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
     """
     check_linear("true error", plant, sensor)
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    # The filter must fit the world in sizes, not in its model.
     start, n = first(plant), len(first(plant).states)
     check_link(first(sensor), first(channel), n, late=True)
     if filter.received != first(channel).outputs or len(filter.states) != n:
         got = f"one of {len(filter.states)} that hears {filter.received}"
         raise fail("filter", f"one of {n} states that hears {first(channel).outputs} numbers", got)
+    # Gains of the filter for these inputs.
     u = array("inputs", np.zeros((check_horizon(horizon), 0)) if inputs is None else inputs, (horizon, None))
     planned = filter.planned(u)
     if not isinstance(planned, PlannedFilter):
         raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
+    # A late channel: past signals are states too.
     if first(channel).past:
         plant, sensor, channel = with_past(plant, sensor, channel)
     begin, total = first(plant), len(first(plant).states)
     initial, world = observation_models(channel)
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
+    # N_j at the start, with r = (x, 1, s).
     mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
     square[:total, :total] += begin.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
+    # Error x - xhat = row r; one prediction and one correction per step.
     row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
@@ -85,7 +103,7 @@ def true_error(
 
 
 def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """x+ = A x + b + w and s- = F s + f, and the modes move."""
+    """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
     n = len(plant.matrix)
     size = moments.shape[-1]
     move = np.zeros((size, size))
@@ -99,13 +117,14 @@ def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, r
 
 
 def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
-    """s = s- + K (z - C s- - c), z = (G, n) of the mode of y~ = C~ x~ + v."""
+    """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
     n, p = sensor.matrix.shape[1], sensor.matrix.shape[0]
     size, gain = moments.shape[-1], np.asarray(plan.gain)
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
     result = []
+    # Given the mode: the mean map of r, then what the gain's spread and the noise add.
     for moment, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
         law = moment[n, n]
         use = np.eye(size)

@@ -1,4 +1,4 @@
-"""Maps of finitely many values: every combination of their gains and noises, each with its probability."""
+"""Channels whose gains and noises take finitely many values: all combinations, each with its probability."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,7 +17,10 @@ COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
 
 
 class Component(NamedTuple):
-    """One combination of atoms: with `weight`, z = gain x + offset + N(0, noise)."""
+    """One combination of atoms: with probability `weight`, z = gain x + offset + N(0, noise).
+
+    Shapes: gain (m, n), offset (m,), noise (m, m).
+    """
 
     weight: float
     gain: np.ndarray
@@ -33,17 +36,21 @@ def atoms_of(item: AbstractRandomAffine) -> list[Component]:
             more than COMPONENT_LIMIT combinations.
     """
     match item:
+        # z = g H y + n: every gain with every noise.
         case GainAndNoise():
             gains, noises = _gain_atoms(item.law), _noise_atoms(item.noise)
             result = [Component(p * q, g * np.asarray(item.matrix), c, r) for p, g in gains for q, c, r in noises]
+        # One map after another: G_2 (G_1 y + n_1) + n_2.
         case Series():
             result = atoms_of(item.maps[0])
             for part in item.maps[1:]:
                 result = _combine(result, atoms_of(part), _after)
+        # Maps of the same signal, stacked.
         case Stack():
             result = atoms_of(item.maps[0])
             for part in item.maps[1:]:
                 result = _combine(result, atoms_of(part), _others)
+        # One of several maps, drawn: p(i) times the atoms of map i.
         case Mixture():
             weighted = zip(item.choice.probabilities, item.maps, strict=True)
             result = [c._replace(weight=p * c.weight) for p, part in weighted for c in atoms_of(part)]
@@ -61,13 +68,13 @@ def _combine(
 
 
 def _after(x: Component, y: Component) -> Component:
-    """y hears x: G_y (G_x s + c_x + n_x) + c_y + n_y."""
+    """Compose maps, y after x: G_y (G_x s + c_x + n_x) + c_y + n_y."""
     noise = y.gain @ x.noise @ y.gain.T + y.noise
     return Component(x.weight * y.weight, y.gain @ x.gain, y.gain @ x.offset + y.offset, noise)
 
 
 def _others(x: Component, y: Component) -> Component:
-    """Both heard, one above the other."""
+    """Stack both maps, one above the other."""
     gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
     return Component(x.weight * y.weight, gain, offset, np.asarray(block_diag(x.noise, y.noise)))
 
@@ -90,16 +97,19 @@ def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
 
 
 def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
-    """All combinations of the atoms of a noise's parts."""
+    """All combinations of the atoms of a noise's components."""
     match noise:
+        # One atom, its mean, with the covariance about it.
         case Gaussian():
             return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
         case FiniteSupport():
             none = np.zeros((noise.dimension, noise.dimension))
             return [(float(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
+        # B n: every atom mapped, B c and B R B'.
         case Shaped():
             b = np.asarray(noise.matrix)
             return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
+        # Independent components: the product of their laws.
         case Independent():
             result = [(1.0, np.zeros(0), np.zeros((0, 0)))]
             for part in noise.parts:

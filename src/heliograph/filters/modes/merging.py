@@ -1,4 +1,4 @@
-"""When the Gaussians of modes are merged, and the mixtures' moments: one Gaussian for all modes, or one for each."""
+"""Merging of the Gaussians of modes: mixture moments, with one Gaussian for all modes or one per mode."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from heliograph.numerics.types import Bool, Float
 class ModalBeliefs(NamedTuple):
     """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
 
-    Shapes: mean (M, n), covariance (M, n, n), weight (M, M); `moved` once the chain was used.
+    Shapes: mean (M, n), covariance (M, n, n), weight (M, M). `moved` is true from the first prediction on.
     """
 
     mean: Float[jax.Array, "M n"]
@@ -26,14 +26,14 @@ class ModalBeliefs(NamedTuple):
 
 
 class AbstractMerging(Module):
-    """When Gaussians are merged."""
+    """Rule that decides when the Gaussians of modes are merged."""
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Components and weights after the chain has moved, before the plant does."""
+        """Components and weights after a transition of the chain, before that of the plant."""
         raise NotImplementedError
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Components and modes to hear with: all that may have a weight."""
+        """Pairs (component, mode) of the measurement update: all that can have a weight."""
         items = np.arange(modes)
         return items, items
 
@@ -42,7 +42,7 @@ class MergeAll(AbstractMerging):
     """One Gaussian for all modes (GPB1)."""
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Every component is the whole mixture."""
+        """Replace every component by the whole mixture."""
         law = jnp.sum(state.weight @ rows, axis=0)
         whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
         every = [jnp.repeat(part, len(rows), axis=0) for part in whole]
@@ -50,24 +50,24 @@ class MergeAll(AbstractMerging):
 
 
 class MergeByNextMode(AbstractMerging):
-    """A Gaussian for each mode, mixed by where the chain comes from (IMM)."""
+    """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Component j is the mixture of all that lead to mode j."""
+        """Component j becomes the mixture of all components that lead to mode j."""
         (mean, covariance), law = merged(state.mean, state.covariance, state.weight @ rows)
         return state._replace(mean=mean, covariance=covariance, weight=jnp.diag(law))
 
 
 class MergeByMode(AbstractMerging):
-    """A Gaussian for each mode, each heard with in every next mode (GPB2)."""
+    """One Gaussian per mode, each updated in every next mode (GPB2)."""
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Components stay with the mode they were heard in."""
+        """Components keep the mode of their last update."""
         (mean, covariance), law = merged(state.mean, state.covariance, state.weight)
         return state._replace(mean=mean, covariance=covariance, weight=law[:, None] * rows)
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Every component with every mode."""
+        """Pair every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
 

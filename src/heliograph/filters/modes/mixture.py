@@ -1,4 +1,4 @@
-"""A filter that knows the full finite-support laws: every combination of gains and noises, then one Gaussian again."""
+"""Filter for laws of finite support: every combination of gains and noises, then one Gaussian by moment matching."""
 
 from typing import NamedTuple
 
@@ -34,9 +34,10 @@ from heliograph.random_affine.modes import JointModes, joint_modes
 
 
 class Components(Module):
-    """All combinations of one step: in their `mode` of the links they have the probability `weight`.
+    """All combinations of atoms of one step, each with its `mode` of the links and its probability in that mode.
 
-    transition: of the modes from the step before; one mode where nothing remembers.
+    weight: P(combination | mode). transition: of the modes from the step before; a single mode for links without
+    memory.
 
     Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m), transition (M, M).
     """
@@ -50,9 +51,9 @@ class Components(Module):
 
 
 class MixtureBelief(NamedTuple):
-    """One Gaussian for the state, and the modes' probabilities; `moved` once the chain was used.
+    """One Gaussian for the state, and the modes' probabilities.
 
-    Shapes: mean (n,), covariance (n, n), law (M,).
+    Shapes: mean (n,), covariance (n, n), law (M,). `moved` is true from the first prediction on.
     """
 
     mean: Float[jax.Array, " n"]
@@ -62,14 +63,14 @@ class MixtureBelief(NamedTuple):
 
 
 class MixtureFilter(AbstractFilter):
-    """One Gaussian for the state; at each step every combination of the measurement's atoms, then moments matched.
+    """One Gaussian for the state; at each step every combination of the measurement's atoms, then moment matching.
 
     With z = G_a x + c_a + N(0, R_a) and probability p_a, the posterior is a mixture of as many Gaussians with weights
-    p_a N(z; G_a m + c_a, G_a P G_a' + R_a); its mean and covariance are kept (GPB1). Behind links that remember p_a is
-    the mode's probability times that of the combination in it; the modes' probabilities are carried along, but not what
-    the state owes to the mode. Nominal: after the first step the prior is not Gaussian, and process noise enters by its
-    covariance only. The log-likelihood is that of the mixture, log sum_a p_a N(z; ...); the innovation's covariance is
-    the mixture's too. A value that no combination leaves says nothing: its log-likelihood is -inf, the state stays.
+    p_a N(z; G_a m + c_a, G_a P G_a' + R_a), replaced by its mean and covariance (GPB1). Behind links with memory p_a is
+    the mode's probability times that of the combination in it; the modes' probabilities are propagated, but not the
+    correlation of state and mode. Nominal: after the first step the prior is not Gaussian, and process noise enters by
+    its covariance only. The log-likelihood is that of the mixture, log sum_a p_a N(z; ...), as is the innovation
+    covariance. A value that no combination can produce is not used: its log-likelihood is -inf, the state stays.
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970), with random gains as modes.
     """
@@ -85,19 +86,19 @@ class MixtureFilter(AbstractFilter):
 
     @property
     def of_atoms(self) -> bool:
-        """It is a mixture over atoms."""
+        """True: it is a mixture over atoms."""
         return True
 
     @in_float64
     def init(self) -> MixtureBelief:
-        """The prior, and the law of the modes at the first use."""
+        """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
         mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
         return MixtureBelief(mean, spread, jnp.asarray(self.initial), jnp.asarray(False))
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
-        """A m + B u + E w and A P A' + Q; the modes move from their second use on."""
+        """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
@@ -105,12 +106,13 @@ class MixtureFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
-        """Weigh the combinations by what arrived of z."""
+        """Correct with z: one Kalman update per combination, weighted by its likelihood, then moment matching."""
         c, z, (mean, spread, law, _) = at(self.components, k), jnp.asarray(z), state
         prior = law[c.mode] * jnp.asarray(c.weight)
         present = ~jnp.isnan(z)
         both = present[:, None] & present
 
+        # Kalman update of one combination: S = G P G' + R, its gain, likelihood and innovation.
         def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
             cross = jnp.where(present[:, None], gain @ spread, 0.0)
             total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
@@ -122,9 +124,11 @@ class MixtureFilter(AbstractFilter):
             return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
 
         likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        # Posterior probabilities p_a N(z; ...), as they were if every combination excludes z.
         weighed = sharpest(likelihood, certain) + jnp.log(prior)
-        excluded = jnp.max(weighed) == -jnp.inf  # no combination leaves such a value: it says nothing
+        excluded = jnp.max(weighed) == -jnp.inf  # no combination can produce such a value
         weight = jax.nn.softmax(jnp.where(excluded, jnp.log(prior), weighed))
+        # Moments of the mixture: P - sum_a w_a K_a S_a K_a' + spread of the means.
         shift = weight @ moved
         apart = moved - shift
         after = (
@@ -132,6 +136,7 @@ class MixtureFilter(AbstractFilter):
             - jnp.einsum("a,aij->ij", weight, known)
             + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
         )
+        # Innovation of the mixture, angles near that of the most probable combination.
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
@@ -140,7 +145,7 @@ class MixtureFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: MixtureBelief) -> Estimate:
-        """The belief, angles between -pi and pi."""
+        """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def smoother_step(
@@ -153,15 +158,16 @@ class MixtureFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """The moments around the update."""
+        """Return the moments around the update."""
         cross = before.covariance @ at(self.plant, k).matrix.T
         return moments_smoother_step(after, prior, cross, "nominal", first(self.plant).angles)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
-    """-inf for a combination that another one, which z agrees with, outweighs by a density that knows no bound.
+    """Set to -inf the likelihood of combinations outweighed by one that agrees with z with a point mass.
 
-    A combination that says `certain` components exactly has a point mass there, against which a density is nothing.
+    `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
+    density is negligible.
     """
     agrees = jnp.isfinite(likelihood)
     most = jnp.max(jnp.where(agrees, certain, -1))
@@ -169,26 +175,33 @@ def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float
 
 
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
-    """The near limit of what the measurements hold, for gains and noises of finitely many values.
+    """Filter on the full laws of gains and noises with finitely many values, with one Gaussian after each step.
 
-    Gains may be constant or discrete, noises of finite support (used atom by atom) or Gaussian. `resolution` is a
-    standard deviation added to z, for a z that is not the model's to the last digit: a combination of atoms that
-    leaves z without any randomness, as a link that is off does, is believed where z agrees with it, and only there.
+    Gains may be constant or discrete, noises of finite support (used atom by atom) or Gaussian. Behind links with
+    memory it propagates the modes' probabilities, with one Gaussian for all; `imm_filter` and `gpb2_filter` have one
+    per mode. Behind slow fading its claim is too small.
 
-    Behind links that remember it carries the modes' probabilities, in one Gaussian for all; `imm_filter` and
-    `gpb2_filter` keep one for each mode. Behind slow fading its claim is too small.
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter.
+        resolution: standard deviation of a noise added to z, 0 by default, for a z that does not follow the model to
+            the last digit. A combination of atoms that leaves z without randomness, as a link that is off does, counts
+            where z agrees with it to this resolution, and only there.
 
     Claim: "nominal".
 
     Raises:
         ValueError: a plant or sensor that is not linear, a gain that drifts, parts that do not fit, a law with no
             atoms, more than COMPONENT_LIMIT combinations.
+
     Source: Ackerson and Fu (1970), first-order generalised pseudo-Bayes.
     """
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
+    # All combinations of atoms, mode by mode, for each step where they vary.
     angles = received_angles(plant, sensor, channel)
     floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):

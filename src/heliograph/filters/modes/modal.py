@@ -1,9 +1,9 @@
-"""The best linear filter behind links that remember: it estimates the state together with the mode of the links.
+"""Best linear filter behind links with memory: it estimates the state jointly with the mode of the links.
 
-With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its step and what is heard of it are linear and their noises
-white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so that a
-Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1), c = E[x]
-without data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
+With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its transition and its measurement are linear and their
+noises white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so
+that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1),
+c = E[x] before data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ from heliograph.random_affine.moments.second_moments import nominal_spread
 class ObservationModel(Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
 
-    transition: of the modes from the step before to this one; radius: how far each may be off.
+    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries.
 
     Shapes: transition and radius (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
     """
@@ -48,9 +48,10 @@ class ObservationModel(Module):
 
 
 class ModalBelief(NamedTuple):
-    """Estimate of zeta, mode after mode, its error's covariance, E[x~ x~' 1{mode}] before any data, and if it moved.
+    """Estimate of zeta, mode by mode, its error covariance, and E[x~ x~' 1{mode}] before any data.
 
-    centre c = E[x] without data; P(mode) c is part of the mean, whose sum over the modes is that of x.
+    centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is true
+    from the first prediction on.
 
     Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1), centre (n,).
     """
@@ -63,11 +64,11 @@ class ModalBelief(NamedTuple):
 
 
 class ModalFilter(AbstractFilter):
-    """The linear minimum-mean-square-error filter of a linear plant behind links that remember.
+    """The linear minimum-mean-square-error filter of a linear plant behind links with memory.
 
-    The estimate of zeta holds that of the modes' probabilities; its covariance is singular, since the modes' indicators
-    sum to 1, and is never inverted. Which components arrive must not depend on the modes. The innovation's covariance
-    is exact; it is not Gaussian, so its Gaussian likelihood is nominal.
+    The estimate of zeta includes the modes' probabilities; its covariance is singular, since the modes' indicators
+    sum to 1, and is never inverted. Which components arrive must not depend on the modes. The innovation covariance
+    is exact; the innovation is not Gaussian, so its Gaussian likelihood is nominal.
 
     Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
     """
@@ -83,32 +84,35 @@ class ModalFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ModalBelief:
-        """The prior, independent of the mode."""
+        """Return the prior, independent of the mode."""
         law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
         moments = law[:, None, None] * second
         return ModalBelief(jnp.kron(law, jnp.append(centre, 1.0)), covariance, moments, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
-        """The plant moves x~, the chain the mode; at the first use the mode has its initial law.
+        """Move x~ by the plant and the mode by the chain; at the first prediction the mode has its initial law.
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
         step, move, noise, centre, rows = self._moves(state, u, k)
         modes, size = len(state.moments), len(move)
+        # E[x~ x~' 1{mode}] one step later.
         carried = move @ state.moments @ move.T
         added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
         moments = jnp.einsum("ij,iab->jab", rows, carried) + added
         chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
         fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
+        # F P F' + the covariance above.
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
+        # F zeta about the moving centre.
         law = state.moments[:, -1, -1]
         mean = step @ (state.mean - known_part(law, state.centre)) + known_part(law @ rows, centre)
         return ModalBelief(mean, covariance, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
-        """Use what arrived of z.
+        """Correct with the components of z that arrived.
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
@@ -118,13 +122,13 @@ class ModalFilter(AbstractFilter):
         return state._replace(mean=mean, covariance=covariance), innovation
 
     def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
-        """F, the plant's A~ and Q~, where c moves, and the rows of the chain."""
+        """Return F, the plant's A~ and Q~, the next centre c, and the transition matrix of the chain."""
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
         return jnp.kron(rows.T, move), move, noise, centre, rows
 
     def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """What is heard of zeta beyond what all modes send, Cov(z - E[z | zeta]), and what all modes send."""
+        """Return the output matrix of zeta less the mean output, Cov(z - E[z | zeta]), and the mean output."""
         channel = at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
         law = state.moments[:, -1, -1]
@@ -150,7 +154,7 @@ class ModalFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """The update of zeta itself."""
+        """Return the linear update of zeta."""
         output, _, _ = self._observe(prior, k)
         return linear_smoother_step(
             after,
@@ -165,12 +169,12 @@ class ModalFilter(AbstractFilter):
         )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before."""
+        """Precompute all covariances and gains."""
         return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
 
 
 def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
-    """The matrix that takes zeta to x = sum_j zeta^j."""
+    """Matrix (n, N) that maps zeta to x = sum_j zeta^j."""
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
@@ -182,10 +186,11 @@ def linear_observation(
     expected: Float[jax.Array, " m"],
     z: ArrayLike,
 ) -> tuple[jax.Array, jax.Array, Innovation]:
-    """Mean and covariance of zeta after what arrived of z, whose covariance given zeta is `added`."""
+    """Posterior mean and covariance of zeta given the components of z that arrived, with Cov(z | zeta) = `added`."""
     z = jnp.asarray(z)
     present = ~jnp.isnan(z)
     both = present[:, None] & present
+    # Innovation covariance S = H P H' + Cov(z | zeta), absent components of unit variance.
     cross = received @ covariance
     total = cross @ received.T + added
     gain, after = gain_and_covariance(
@@ -231,13 +236,13 @@ def moved_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[ja
 
 
 def measured_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """C~ and R~ of the same: y = C (x - c) + C c + E v."""
+    """C~ and R~ of the centred state: y = C (x - c) + C c + E v."""
     measure, noise = measure_matrix(sensor)
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
 
 def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What the modes send beside what is sent on average (the indicators sum to 1: it tells nothing of them), and that.
+    """Subtract the mean output over the modes, which says nothing of the mode as the indicators sum to 1; return both.
 
     Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
     """
@@ -246,7 +251,7 @@ def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def joined(output: jax.Array) -> jax.Array:
-    """(M, m, n + 1) as one matrix (m, N) that reads zeta."""
+    """Output matrices (M, m, n + 1) as one matrix (m, N) that acts on zeta."""
     return jnp.concatenate(list(output), axis=1)
 
 
@@ -256,14 +261,14 @@ def padded(a: jax.Array) -> jax.Array:
 
 
 def blocks(parts: jax.Array) -> jax.Array:
-    """(M, s, s) on the diagonal of (M s, M s)."""
+    """Matrices (M, s, s) as the diagonal blocks of (M s, M s)."""
     modes, size, _ = parts.shape
     placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
     return placed.reshape(modes * size, modes * size)
 
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
-    """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
+    """Best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
     start, (initial, described) = first(plant), observation_models(channel)
     return ModalFilter(
         plant=plant,
@@ -278,7 +283,7 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
 
 
 def observation_models(channel: Channel) -> tuple[Float[Array, " M"], ObservationModel | OverTime]:
-    """Law of the modes at the first step, and what is heard at each; a channel that forgets has one mode."""
+    """Law of the modes at the first step, and the observation model of each; links without memory have one mode."""
     if not isinstance(channel, OverTime):
         modes = joint_modes(channel)
         return modes.initial, observation_model(modes, modes)
@@ -288,7 +293,7 @@ def observation_models(channel: Channel) -> tuple[Float[Array, " M"], Observatio
 
 
 def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
-    """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
+    """Moments of the channel by mode at one step, and the transition from the step before."""
     mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
     spread = stacked([nominal_spread(m).center for m in now.maps])
     return ObservationModel(before.transition, before.radius, mean, spread)

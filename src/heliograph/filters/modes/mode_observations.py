@@ -1,4 +1,4 @@
-"""What arrives weighs modes: beliefs corrected in their mode, and each mode by how likely what came is."""
+"""Measurement updates by mode: each belief corrected in its mode, each mode weighted by its likelihood."""
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +30,15 @@ def receive(
     size: jax.Array,
     angles: Angles = (),
 ) -> tuple[Belief, jax.Array, Innovation]:
-    """Each belief corrected in its mode, its weight after z and after what arrived of it, and the mixture's innovation.
+    """Correct each belief in its mode; return the beliefs, their posterior weights, and the mixture's innovation.
 
     `size`: E[x_i^2] at the start, (n,).
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
     """
+    # Channel moments by mode, given which components arrived.
     kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
     mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
+    # Prior weights given which components arrived.
     chance = weight * jnp.asarray(channel.chance)[mode, kind]
     prior = chance / jnp.sum(chance)
 
@@ -47,6 +49,7 @@ def receive(
         return corrected(separate, sent, link, Polytope(), z, size, angles)
 
     result, received = jax.vmap(single)(belief, signal, mean, spread)
+    # Posterior weights, log w + log N(z; ...).
     possible = prior > 0  # a mode in which this cannot arrive has no map for it
     after = Belief(
         jnp.where(possible[:, None], result.mean, belief.mean),
@@ -59,10 +62,10 @@ def receive(
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
-    """The law of the modes at the first use, and the channel by mode and by what arrives, at each step if it varies.
+    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step if it varies.
 
     Raises:
-        ValueError: too many modes, maps whose moments are not known, a mode whose output is certain beside others: a
+        ValueError: too many modes, maps whose moments are unknown, a mode whose output is certain among others: a
             probability cannot be weighed against densities.
     """
     steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
@@ -74,7 +77,7 @@ def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], Si
 
 
 def _check_random(channel: SideInformation) -> None:
-    """Every combination of mode and pattern gives z a density, for an x that has one."""
+    """Check that z has a density in every combination of mode and pattern, for an x that has one."""
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
         random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]

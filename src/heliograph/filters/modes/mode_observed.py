@@ -1,4 +1,4 @@
-"""Filters that are told what the links remember: now, or one step late, when the last update is redone with it."""
+"""Filters with side information on the links' memory: its state at this step, or at the step before."""
 
 from itertools import product
 from math import prod
@@ -33,7 +33,7 @@ Moved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 class ModeObservedBelief(NamedTuple):
-    """The belief; that before the last correction, what was heard then, and how the plant moved since.
+    """Posterior, the prior of the last correction, the measurement used then, and the plant's motion since.
 
     Shapes: z (m,), move ((n, n), (n,), (n, n)).
     """
@@ -46,16 +46,16 @@ class ModeObservedBelief(NamedTuple):
 
     @property
     def mean(self) -> Float[jax.Array, " n"]:
-        """The estimate's mean."""
+        """Mean of the estimate."""
         return self.belief.mean
 
 
 class ModeObservedFilter(AbstractFilter):
-    """The best linear filter given what the links remember, at each step with z, or of the step before (`late`).
+    """Best linear filter given the states of the links' memories, at each step with z, or of the step before (`late`).
 
-    It hears z and the states of the memories after it, as `with_flag` delivers them. Late, the last update is redone
-    with the mode that is now known, then z is used under the law of the mode that follows. Where a state is missing z
-    is not used.
+    The received vector is z followed by the states of the memories, as `with_flag` delivers them. If they are late, the
+    last update is repeated with the mode that is now known, then z is used under the law of the mode that follows.
+    Where a state is missing z is not used.
 
     Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
     """
@@ -71,7 +71,7 @@ class ModeObservedFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ModeObservedBelief:
-        """The prior."""
+        """Return the belief before any data."""
         start = at(self.plant, 0)
         mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
         belief = LinearBelief(mean, spread, mean, spread)
@@ -81,7 +81,7 @@ class ModeObservedFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
-        """Both moments over step k."""
+        """Predict both pairs of moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         move = jnp.asarray(plant.matrix), shift, jnp.asarray(plant.noise_covariance(u))
@@ -89,8 +89,9 @@ class ModeObservedFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
-        """Use z with what is known of the mode."""
+        """Correct with z, given the received state of the memories."""
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        # Received vector: z, then the states of the memories.
         m = channel.outputs
         z, published = observed[:m], observed[m:]
         known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
@@ -107,10 +108,12 @@ class ModeObservedFilter(AbstractFilter):
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
         else:
             prior, described = state.belief, _given(channel, certain)
+        # Update with z, which is not used where a state is missing.
         usable = jnp.where(known, z, jnp.nan)
         after, expected, covariance = _use(prior, sensor, described, usable, size)
         innovation = gaussian_innovation(z, expected, covariance)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
+        # The flags belong to the innovation; they add nothing to the likelihood.
         for item in published:
             flag_innovation, spread = with_flag(spread, item)
             value = jnp.append(value, flag_innovation)
@@ -119,7 +122,7 @@ class ModeObservedFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: ModeObservedBelief) -> Estimate:
-        """The estimate's mean and covariance."""
+        """Mean and covariance of the estimate."""
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)
 
 
@@ -133,7 +136,7 @@ def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
 def _use(
     prior: LinearBelief, sensor: LinearSensor, described: SecondOrder, z: jax.Array, size: jax.Array
 ) -> tuple[LinearBelief, jax.Array, jax.Array]:
-    """The update, what was expected and the innovation's covariance."""
+    """Return the updated belief, the expected measurement and the innovation covariance."""
     of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
     noise = jnp.asarray(sensor.noise.covariance)
     y = signal(prior[1:], *of, noise)._replace(matrix=of[0], noise=noise)
@@ -151,7 +154,7 @@ def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
 
 
 def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
-    """The law of the step after one in which the memories' states were these; without one, of the first step."""
+    """Law of the channel given the memories' states at the step before; without them, of the first step."""
     items = []
     for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
         items.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
@@ -162,7 +165,7 @@ def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine,
 
 
 def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
-    """Mean and spread under the nominal law, of numbers that may be traced."""
+    """Mean and spread under the nominal law, for numbers that may be traced."""
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
@@ -170,26 +173,40 @@ def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
 
 
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
-    """The best linear filter that is told, with each measurement, what the links remember: modes, or drifting gains.
+    """Best linear filter with side information: the current modes or drifting gains of the links arrive with z.
 
-    It takes what `with_flag(link)` delivers; a `Node` refuses flags of the step before. Claim: "exact", given what is
-    told; "nominal" where probabilities within a mode are uncertain.
+    Its measurements are those of `with_flag(link)`; a `Node` refuses flags of the step before.
+
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter, without the flags and without erasures.
+
+    Claim: "exact", given the side information; "nominal" where probabilities within a mode are uncertain.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
+
     Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
     """
     return _mode_observed(plant, sensor, channel, late=False)
 
 
 def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
-    """The best linear filter that is told, with each measurement, what the links remembered at the step before.
+    """Best linear filter with delayed side information: the links' modes or drifting gains of the step before.
 
-    It takes what `with_flag(link, late=True)` delivers; a `Node` refuses flags of the same step. Claim: as
-    `mode_known_filter`.
+    Its measurements are those of `with_flag(link, late=True)`; a `Node` refuses flags of the same step.
+
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter, without the flags and without erasures.
+
+    Claim: as `mode_known_filter`.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
+
     Source: the Kalman filter given the modes, and one update with the law of the mode that follows the last.
     """
     return _mode_observed(plant, sensor, channel, late=True)
@@ -197,10 +214,12 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
 
 def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
     check_linear("filter that is told the mode", plant, sensor)
+    # Erasures are side information of another kind.
     steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
     if any(step.erases for step in steps if isinstance(step, AbstractRandomAffine)):
         expected = "a channel without erasures (side_information_filter with flags=np.eye(modes) takes them)"
         raise fail("filter that is told the mode", expected, "one that loses packets")
+    # Received: z and one number per memory.
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     return ModeObservedFilter(

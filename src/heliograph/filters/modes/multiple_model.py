@@ -1,7 +1,7 @@
-"""Filters that weigh the modes of links that remember: a Gaussian for each mode, or one for all, mixed at each step.
+"""Multiple-model filters for links with memory: modes weighted by likelihood, one Gaussian per mode or for all.
 
-Each knows the chain, hears through each mode's map with a Gaussian update, and weighs modes by how likely what came is.
-They differ in when Gaussians are merged; all keep only two moments of a mixture, so that they claim nothing exact.
+Each uses the Markov chain, updates through each mode's map with a Gaussian update, and weights modes by likelihood.
+They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
 import equinox as eqx
@@ -41,9 +41,9 @@ NODES = 3  # modes that stand for a gain that drifts
 
 
 class MultipleModelFilter(AbstractFilter):
-    """A filter of the state and of the mode of links that remember; built by `imm_filter` and its kin.
+    """Filter of the state and of the mode of links with memory; built by `imm_filter`, `gpb1_filter` and `gpb2_filter`.
 
-    Nominal: mixtures are cut down to two moments. The innovation is that of the mixture, its log-likelihood too.
+    Nominal: mixtures are reduced to two moments. The innovation is that of the mixture, as is its log-likelihood.
     """
 
     plant: AnyPlant
@@ -60,7 +60,7 @@ class MultipleModelFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ModalBeliefs:
-        """The prior in every component; the modes of the first use."""
+        """Return the prior in every component, and the initial law of the modes."""
         start, modes = at(self.plant, 0), len(self.initial)
         mean = jnp.tile(jnp.asarray(start.initial_mean), (modes, 1))
         spread = jnp.tile(jnp.asarray(start.initial_covariance), (modes, 1, 1))
@@ -68,7 +68,7 @@ class MultipleModelFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
-        """The chain moves, then the plant, component by component; at the first use the chain has its initial law."""
+        """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
@@ -78,7 +78,7 @@ class MultipleModelFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
-        """Hear z with each component in each mode, and weigh them by it."""
+        """Correct each component in each mode with z, and weight them by their likelihood."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
@@ -107,7 +107,7 @@ class MultipleModelFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """Moments of the whole mixture around the update; nothing later is said of the modes."""
+        """Return the moments of the whole mixture around the update; modes are not smoothed."""
         local = _whole(before)
         cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
         return moments_smoother_step(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
@@ -120,7 +120,7 @@ def _whole(state: ModalBeliefs) -> Belief:
 
 
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
-    """Means (components, n) with their angles near those of the likeliest component, so that they can be averaged."""
+    """Means (components, n) with angles near those of the most probable component, so that they can be averaged."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
@@ -134,6 +134,7 @@ def _build(
 ) -> MultipleModelFilter:
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
+    # Channel by mode, with `nodes` modes for a gain that drifts.
     angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)
     return MultipleModelFilter(
@@ -158,17 +159,24 @@ def imm_filter(
     transform: AbstractTransform | None = None,
     nodes: int = NODES,
 ) -> MultipleModelFilter:
-    """The interacting multiple model filter of a plant behind links that remember: one Gaussian for each mode.
+    """Interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
-    Before each step they are mixed by where the next mode may come from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
-    modes are weighed by the likelihood of z. A gain that is random within a mode is known by its second moments, and a
-    drift by `nodes` modes of its own; losses inside the channel, told, say something of the mode too. `transform` is
-    `Cubature()` unless given, and not used for linear parts.
+    Before each step they are mixed by the mode that the next one comes from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
+    modes are weighted by the likelihood of z. A gain that is random within a mode enters by its second moments;
+    erasures inside the channel are information on the mode too.
 
-    Claim: "nominal". It tends to claim too little where modes are hard to tell for many steps.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, with memory.
+        transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
+        nodes: number of modes that stand for a gain that drifts; 3 by default.
+
+    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps.
 
     Raises:
-        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain beside others.
+        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
+
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
     return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)
@@ -181,14 +189,22 @@ def gpb1_filter(
     transform: AbstractTransform | None = None,
     nodes: int = NODES,
 ) -> MultipleModelFilter:
-    """The filter with one Gaussian for all modes of links that remember, and the modes' probabilities beside it.
+    """First-order generalised pseudo-Bayes filter behind links with memory: one Gaussian and the modes' probabilities.
 
-    Arguments as for `imm_filter`; M updates a step, and none of the memory that couples the state with the mode.
+    M updates a step; the correlation of state and mode is not propagated.
 
-    Claim: "nominal", and too small where fading is slow: what the state owes to the mode is forgotten at each step.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, with memory.
+        transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
+        nodes: number of modes that stand for a gain that drifts; 3 by default.
+
+    Claim: "nominal", and too small where fading is slow: the correlation of state and mode is dropped at each step.
 
     Raises:
         ValueError: as for `imm_filter`.
+
     Source: Ackerson and Fu, On state estimation in switching environments (1970).
     """
     return _build(plant, sensor, channel, MergeAll(), transform, nodes)
@@ -201,15 +217,21 @@ def gpb2_filter(
     transform: AbstractTransform | None = None,
     nodes: int = NODES,
 ) -> MultipleModelFilter:
-    """The filter with a Gaussian for each mode, each heard with in every next mode before they are merged: M^2 updates.
+    """Second-order generalised pseudo-Bayes filter: a Gaussian per mode, each updated in every next mode, M^2 updates.
 
-    Arguments as for `imm_filter`.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, with memory.
+        transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
+        nodes: number of modes that stand for a gain that drifts; 3 by default.
 
-    Claim: "nominal". With few modes that the data tells apart it is close to all that can be known; behind slow fading
-    of many modes it claims too little, as the others do.
+    Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
+    many modes it is too small, as for the others.
 
     Raises:
         ValueError: as for `imm_filter`.
+
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """
     return _build(plant, sensor, channel, MergeByMode(), transform, nodes)

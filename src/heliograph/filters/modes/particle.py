@@ -1,4 +1,4 @@
-"""Particles for the modes of links that remember, and a Gaussian for the state in each: the limit of filters."""
+"""Rao-Blackwellised particle filter: particles for the modes of links with memory, each with a Gaussian state."""
 
 from typing import NamedTuple
 
@@ -30,9 +30,10 @@ NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 
 
 class Particles(NamedTuple):
-    """Each particle's Gaussian, present mode and weight; the bits that the next random numbers come from.
+    """Gaussian, present mode and weight of each particle, and the key of the next random numbers.
 
-    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,); `moved` once the chain was used.
+    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,). `moved` is true from the first
+    prediction on.
     """
 
     mean: Float[jax.Array, "N n"]
@@ -46,7 +47,7 @@ class Particles(NamedTuple):
 class ParticleFilter(AbstractFilter):
     """Particles draw the modes; given their path the state is Gaussian (Rao-Blackwell). Built by `particle_filter`.
 
-    Its random numbers come from the seed and from the data, so that every run has its own and the same data give the
+    Its random numbers come from the seed and from the data, so that runs draw independently and the same data give the
     same estimate.
     """
 
@@ -65,7 +66,7 @@ class ParticleFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Particles:
-        """The prior in every particle, modes in the shares of their law at the first use."""
+        """Return the prior in every particle, with modes in proportion to their initial law."""
         start, n = at(self.plant, 0), self.particles
         mean = jnp.tile(jnp.asarray(start.initial_mean), (n, 1))
         spread = jnp.tile(jnp.asarray(start.initial_covariance), (n, 1, 1))
@@ -74,7 +75,7 @@ class ParticleFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
-        """Draw each particle's next mode, and move its Gaussian."""
+        """Draw each particle's next mode, and predict its Gaussian."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
@@ -86,7 +87,7 @@ class ParticleFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
-        """Hear z with each particle, weigh them by it, and draw them anew where half of them weigh next to nothing."""
+        """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
         start = at(self.plant, 0)
@@ -97,6 +98,7 @@ class ParticleFilter(AbstractFilter):
             belief, signals, channel, state.mode, state.weight, z, size, self.observed_angles
         )
         after = after._replace(mean=together(plant, after.mean, weight))
+        # Systematic resampling.
         key = _folded(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
@@ -122,7 +124,7 @@ def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
 
 
 def _folded(key: jax.Array, z: jax.Array) -> jax.Array:
-    """A key made of another one and of the bits of a measurement."""
+    """Key made of another one and of the bits of a measurement."""
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
     for part in bits.ravel():
         key = jax.random.fold_in(key, part)
@@ -138,21 +140,32 @@ def particle_filter(
     transform: AbstractTransform | None = None,
     nodes: int = NODES,
 ) -> ParticleFilter:
-    """A Rao-Blackwellised particle filter of a plant behind links that remember: what others can be compared with.
+    """Rao-Blackwellised particle filter of a plant behind links with memory: a reference for the other filters.
 
     Each particle draws a path of modes and carries the Gaussian filter of that path; systematic resampling where the
-    effective number of particles is below half. A gain that drifts has `nodes` modes. Its random numbers come from
-    `seed` and from the data. Error of the mixture's moments: in proportion to 1 / root of `particles`.
+    effective number of particles is below half. Error of the mixture's moments: in proportion to 1 / root of
+    `particles`.
 
-    Claim: "nominal": with finitely many particles, and Gaussians in each, it approaches the truth from either side.
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter, with memory.
+        particles: their number; 300 by default.
+        seed: of the random numbers, which depend on the data too; 0 by default.
+        transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
+        nodes: number of modes that stand for a gain that drifts; 9 by default.
+
+    Claim: "nominal": with finitely many particles, and a Gaussian in each, it approaches the truth from either side.
 
     Raises:
         ValueError: a count of particles below 1, and as for `imm_filter`.
+
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
         2001.
     """
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
+    # Channel by mode, with `nodes` modes for a gain that drifts.
     angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)
     return ParticleFilter(

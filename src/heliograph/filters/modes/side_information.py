@@ -1,4 +1,4 @@
-"""Filters that are told something of the modes: which packets arrived, a flag with each packet, or the mode itself."""
+"""Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,10 +29,11 @@ from heliograph.random_affine.side_information import Outcome, outcomes, second_
 
 
 class SideInformation(Module):
-    """A channel at one step, by mode and by what arrives.
+    """A channel at one step, by mode and by pattern of arrivals.
 
-    transition: of the modes from the step before to this one. Of each pattern of components that arrive: `present`, its
-    `chance` in each mode, and in that mode and pattern E[(G, n)] and the spread, as a tensor. flags: P(flag | mode).
+    transition: of the modes from the step before to this one. For each pattern of components that arrive: `present`,
+    its `chance` in each mode, and in that mode and pattern E[(G, n)] and the spread, as a tensor. flags: P(flag |
+    mode).
 
     Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), spread (M, A, m, m, p + 1, p + 1),
     flags (M, F).
@@ -47,10 +48,10 @@ class SideInformation(Module):
 
 
 class SideInformationBelief(NamedTuple):
-    """s, the estimate of zeta, and E[r r' 1{mode} | what was told] of r = (x~, s, e), with the error e = zeta - s.
+    """s, the estimate of zeta, and E[r r' 1{mode} | side information] of r = (x~, s, e), with the error e = zeta - s.
 
-    x~ = (x - c, 1), c = E[x] before any data, and zeta holds x~ 1{mode}, mode after mode. That s + e = zeta is told
-    twice on purpose: no covariance is the difference of larger ones.
+    x~ = (x - c, 1), c = E[x] before any data, and zeta holds x~ 1{mode}, mode after mode. Both s and e are carried
+    though s + e = zeta is known: no covariance is the difference of larger ones.
 
     Shapes: with N = M (n + 1): centre (n,), mean (N,), moments (M, n + 1 + 2 N, n + 1 + 2 N).
     """
@@ -62,25 +63,26 @@ class SideInformationBelief(NamedTuple):
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
-        """E[e e' | what was told]."""
+        """E[e e' | side information]."""
         count = len(self.mean)
         return jnp.sum(self.moments, axis=0)[-count:, -count:]
 
 
 class SideInformationFilter(AbstractFilter):
-    """A linear filter that weighs the modes by what is told with each packet, and knows its error given all that.
+    """A linear filter that weights the modes by side information with each packet, and conditions its covariance on it.
 
-    A flag (and whether a packet arrived) changes the law of the modes, and with it what the estimate so far is worth:
-    s = E[zeta r'] E[r r']^+ r is found anew from moments given the flags, with r = (1, s, z). Its covariance is exact
-    given what was told; a filter that kept all data could do a little better, since earlier gains were right under
-    earlier laws.
+    A flag (and whether a packet arrived) changes the law of the modes, and with it the accuracy of the estimate so far:
+    s = E[zeta r'] E[r r']^+ r is recomputed from moments given the flags, with r = (1, s, z). Its covariance is exact
+    given the side information; a filter of all past data could do a little better, since earlier gains were optimal
+    under earlier laws.
 
-    It hears z and, where there are `flags`, the number of the flag after it; the likelihood is that of z given these.
-    What is lost for reasons that the channel does not know must not depend on the modes. Moments are those of x - E[x],
-    and the error has its own: a mean far from zero costs no digits, and with one mode no precise measurement does. With
-    several, x is the sum of its parts in each: a variance below 1e-15 of the state's own is rounding, of either sign.
+    Its measurement is z and, where there are `flags`, the number of the flag after it; the likelihood is that of z
+    given these. Losses that the channel does not model must not depend on the modes. Moments are those of x - E[x], and
+    the error has moments of its own: a mean far from zero costs no digits, and with one mode no precise measurement
+    does. With several, x is the sum of its parts in each: a variance below 1e-15 of the state's is rounding, of either
+    sign.
 
-    Source: the filter of Costa (1994) with moments conditional on what is told.
+    Source: the filter of Costa (1994) with moments conditional on the side information.
     """
 
     plant: AnyPlant
@@ -95,7 +97,7 @@ class SideInformationFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> SideInformationBelief:
-        """The prior, independent of the mode."""
+        """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         square = padded(jnp.asarray(start.initial_covariance)).at[-1, -1].set(1.0)
         item = jnp.zeros(len(square)).at[-1].set(1.0)
@@ -112,12 +114,15 @@ class SideInformationFilter(AbstractFilter):
         move, noise, centre = moved_about(plant, u, state.centre)
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
+        # F acts on s and on e, A~ on x~.
         step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
         whole = jax.scipy.linalg.block_diag(move, step, step)
+        # (1_j - p_i) x A~ x~: the random transition of the mode, which enters the error.
         chosen = jnp.einsum("ijl,ab->ijlab", jnp.eye(modes) - rows[:, None], jnp.eye(size))
         change = jnp.broadcast_to(jnp.eye(len(whole)), (modes, modes, *whole.shape))
         change = change.at[:, :, -len(step) :, :size].set(chosen.reshape(modes, modes, -1, size))
         carried = change @ (whole @ state.moments @ whole.T)[:, None] @ change.swapaxes(2, 3)
+        # Process noise, in x~ and in the error of mode j.
         fresh = _stacked(jnp.eye(size), jnp.zeros((len(step), size)), _deviations(modes, size))
         moments = jnp.einsum("ij,ijab->jab", rows, carried)
         moments = moments + (law @ rows)[:, None, None] * (fresh @ noise @ fresh.swapaxes(1, 2))
@@ -127,18 +132,21 @@ class SideInformationFilter(AbstractFilter):
     def correct(
         self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
     ) -> tuple[SideInformationBelief, Innovation]:
-        """Weigh the modes by the flag and by what arrived, project s anew, then use z."""
+        """Weight the modes by the flag and by the pattern of arrivals, project s again, then use z."""
         sensor, known, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
+        # P(flag, pattern | mode).
         flag_there, there = ~jnp.isnan(flag), ~jnp.isnan(z)
         number = jnp.clip(jnp.where(flag_there, flag, 0.0).astype(int), 0, known.flags.shape[1] - 1)
         spelled = jnp.where(flag_there, jnp.asarray(known.flags)[:, number], 1.0)
         kind = pattern_of(known, there)
         weight = jnp.asarray(known.chance)[:, kind] * spelled
         size = len(self.states) + 1
+        # Moments given the side information, and the best s under them.
         total = weight @ state.moments[:, size - 1, size - 1]
         moments = weight[:, None, None] * state.moments / total
         prior = _projected(state._replace(moments=moments), size)
+        # Kalman update of zeta with the components that arrived.
         after, value, covariance = _used(
             prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there
         )
@@ -170,7 +178,7 @@ def _stacked(x: jax.Array, s: jax.Array, e: jax.Array) -> jax.Array:
 
 
 def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
-    """The best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
+    """Best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
     count, total = len(state.mean), jnp.sum(state.moments, axis=0)
     known = slice(size - 1, size + count)
     change = pseudo_solve(total[known, known], total[known, -count:]).T
@@ -187,20 +195,24 @@ def _used(
     z: jax.Array,
     there: jax.Array,
 ) -> tuple[SideInformationBelief, jax.Array, jax.Array]:
-    """The update with what arrived, e+ = (I - K H) e - K noise; what was not expected, and its covariance."""
+    """Update with what arrived, e+ = (I - K H) e - K noise; returns the innovation and its covariance too."""
     measure, noise = measured_about(sensor, state.centre)
     size = measure.shape[1]
+    # Cov(z | zeta, mode) = T_j(E[y y' 1{j}]) + P(j) Hbar_j R~ Hbar_j'.
     law = state.moments[:, size - 1, size - 1]
     second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
     added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
+    # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = without_common(mean @ measure, law)
     output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
     prior = state.covariance
+    # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1.
     cross, value = output @ prior, z - common - output @ state.mean
     total = cross @ output.T + jnp.sum(added, axis=0)
     seen = jnp.where(there[:, None] & there, total, 0.0) + absent(there)
     gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
     both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
+    # s+ = s + K (H e + noise), e+ = e - K (H e + noise).
     change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ output)
     moments = change @ state.moments @ change.T
     moments = moments.at[:, size:, size:].add(both @ added @ both.T)
@@ -209,14 +221,14 @@ def _used(
 
 
 def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
-    """The smallest pattern that can be and in which everything that is there arrives."""
+    """Index of the smallest possible pattern in which every component that is there arrives."""
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
     fits = jnp.all(present | ~there, axis=1) & possible
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
 
 def with_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Innovation of a flag, which is told and not estimated: 0, or NaN if missing; no covariance with anything."""
+    """Innovation of a flag, which is known and not estimated: 0, or NaN if missing; uncorrelated with everything."""
     nis = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
     lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), nis))
     wide = jnp.pad(covariance, ((0, 1), (0, 1)))
@@ -224,31 +236,37 @@ def with_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def side_information_filter(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: ArrayLike | None = None
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Float[ArrayLike, "modes flags"] | None = None
 ) -> SideInformationFilter:
-    """The linear filter that uses what is told of the modes: which packets arrived, and a flag with each.
+    """Linear filter with side information on the modes: which packets arrived, and a flag with each.
 
-    `channel` may lose data with probabilities that depend on the mode (`erasure` in its modes). `flags` are P(flag |
-    mode), the modes as in `joint_modes`; the filter then hears (z, flag), as `with_flag` delivers it. Flags that reveal
-    the mode make it the Kalman filter given the modes.
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        channel: from the sensor to the filter; it may lose data with probabilities that depend on the mode (`erasure`
+            in its modes).
+        flags: P(flag | mode), shape (modes, flags), the modes as in `joint_modes`; the measurement is then (z, flag),
+            as `with_flag` delivers it. Flags that identify the mode make it the Kalman filter given the modes. None by
+            default: no flags.
 
     Claim: "exact"; "nominal" where probabilities are uncertain.
 
-    Shapes: flags (modes, flags).
-
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, flags that are no probabilities.
-    Source: the filter of Costa (1994) with moments conditional on what is told.
+
+    Source: the filter of Costa (1994) with moments conditional on the side information.
     """
     check_linear("told filter", plant, sensor)
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
+    # P(flag | mode); one flag that is always the same where there are none.
     steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     modes = len(steps[0].initial)
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):
         probabilities(f"flags in mode {i}", row)
     described = by_pattern(steps, chances)
+    # Exact needs known probabilities, within the modes and of the chain.
     known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
     return SideInformationFilter(
         plant=plant,
@@ -264,7 +282,7 @@ def side_information_filter(
 
 
 def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
-    """The modes at each step by what arrives, with the patterns of all steps, and how they moved there."""
+    """Moments of the channel at each step by mode and pattern of arrivals, with the patterns of all steps."""
     items = [[outcomes(m) for m in step.maps] for step in steps]
     results = {tuple(o.arrived) for modes in items for parts in modes for o in parts}
     kinds = sorted(results, key=lambda kind: (sum(kind), kind))
@@ -277,6 +295,7 @@ def _side_information(
 ) -> SideInformation:
     m, p = items[0][0].map.outputs, items[0][0].map.inputs + 1
     shape = (len(items), len(kinds))
+    # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].
     chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
     for j, parts in enumerate(items):
         for part in parts:
@@ -284,6 +303,7 @@ def _side_information(
             chance[j, a] += part.probability
             mean[j, a] += part.probability * first_order
             second[j, a] += part.probability * second_order
+    # Conditional moments given mode and pattern.
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
     spread = second - np.array([[symmetric_product(item, item) for item in row] for row in mean])

@@ -1,8 +1,8 @@
-"""An upper bound behind chains whose transition probabilities are known only roughly, differently at each step.
+"""Upper bound behind Markov chains with uncertain, time-varying transition probabilities.
 
 With Pi + Delta_k for Pi, |Delta| <= radius, rows that sum to 0: the error before z is F e + (Delta x A~) zeta + w, so
 Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta_i' x A~ Xi A~' for every such chain.
-What depends on the law p of the modes is bounded over the interval in which p can be.
+Terms that depend on the law p of the modes are bounded over the interval of possible p.
 """
 
 from dataclasses import replace
@@ -40,9 +40,10 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 
 class UncertainBelief(NamedTuple):
-    """Estimate of zeta, a bound on its error's covariance, E[x~ x~'], and between what the modes' probabilities are.
+    """Estimate of zeta, a bound on its error covariance, E[x~ x~'], and bounds on the modes' probabilities.
 
-    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`.
+    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is true from the first
+    prediction on.
 
     Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), centre (n,), law, low and high (M,).
     """
@@ -58,9 +59,9 @@ class UncertainBelief(NamedTuple):
 
 
 class UncertainModalFilter(AbstractFilter):
-    """A linear filter whose covariance dominates its error's for every chain within the radius of the given one.
+    """A linear filter whose covariance bounds its error's for every chain within the radius of the nominal one.
 
-    Source: the filter of Costa (1994) with Young's inequality for what the chain is not known to be.
+    Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.
     """
 
     plant: AnyPlant
@@ -74,37 +75,41 @@ class UncertainModalFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> UncertainBelief:
-        """The prior, independent of the mode, whose initial law is known."""
+        """Return the prior, independent of the mode, whose initial law is known."""
         law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
         mean = jnp.kron(law, jnp.append(centre, 1.0))
         return UncertainBelief(mean, covariance, second, centre, law, law, law, jnp.asarray(False))
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
-        """Sigma- from above; at the first use the mode has its initial law."""
+        """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
         channel = at(self.channel, k)
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         modes = len(state.law)
+        # Bounds on Cov(1{next} | i) and on Delta_i Delta_i', over all laws of the mode.
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         radius = jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
         carried = move @ state.second @ move.T
         chosen, wandering = _each_row(rows, radius)
         middle, reach = _middle(state.low, state.high)
+        # F Sigma F', D, and the bound W on the covariance of the noise.
         step = jnp.kron(rows.T, move)
         known = step @ state.covariance @ step.T
         apart = jnp.kron(_worst(wandering, middle, reach), carried)
         low, high = _bounds(rows, radius, state.low, state.high)
         fresh = jnp.kron(_worst(chosen, middle, reach), carried) + jnp.kron(_worst_diagonal(low, high), noise)
+        # Young's inequality, b = root(tr D / tr F Sigma F').
         young = jnp.sqrt(_ratio(jnp.trace(apart), jnp.trace(known)))
         extra = jnp.where(young > 0, apart + apart / jnp.where(young > 0, young, 1.0), 0.0)
         covariance = symmetrize((1 + young) * known + extra + fresh)
+        # E[x~ x~'], nominal law and mean one step later.
         after, law = carried + noise, state.law @ rows
         mean = step @ (state.mean - known_part(state.law, state.centre)) + known_part(law, centre)
         return UncertainBelief(mean, covariance, after, centre, law, low, high, jnp.asarray(True))
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
-        """Use what arrived of z; the covariance of z given zeta is bounded over the laws of the modes."""
+        """Correct with z; the covariance of z given zeta is bounded over the laws of the modes."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
@@ -132,7 +137,7 @@ class UncertainModalFilter(AbstractFilter):
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
-        """The moments of zeta around the update; what is proved of the filter's bound is not of theirs."""
+        """Return the moments of zeta around the update; the filter's bound is not proved for smoothed estimates."""
         move, _, _ = moved_about(at(self.plant, k), u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
@@ -140,7 +145,7 @@ class UncertainModalFilter(AbstractFilter):
         return replace(moments_smoother_step(after, prior, cross, "nominal"), projection=jnp.asarray(projection))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before."""
+        """Precompute all covariances and gains."""
         return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
 
 
@@ -149,10 +154,10 @@ def _ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
 
 
 def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """For each mode i, above Cov(1{next} | i) and above Delta_i Delta_i', for every Delta_i.
+    """Bounds on Cov(1{next} | i) and on Delta_i Delta_i', for each mode i and every Delta_i.
 
     Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
-    what is left without the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
+    the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
     """
     modes = len(rows)
     apart = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
@@ -163,21 +168,21 @@ def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]
 
 
 def _middle(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A law between the ends (its sum is 1), and how far from it a law there can be."""
+    """A law between the ends (its sum is 1), and the largest deviation of a possible law from it."""
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
     return middle, jnp.maximum(high - middle, middle - low)
 
 
 def _worst(items: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
-    """Above sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
+    """Bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
     values, vectors = jax.vmap(eigh)(items - jnp.mean(items, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
     return jnp.einsum("i,iab->ab", middle, items) + jnp.einsum("i,iab->ab", reach, sizes)
 
 
 def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Above diag(p) for all laws p, and little above it in the direction of x, which is that of equal entries.
+    """Bound on diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
 
     delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
@@ -193,13 +198,13 @@ def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def _bounds(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends of every mode's next probability, over the laws between `low` and `high`."""
+    """Bounds on every mode's next probability, over the laws between `low` and `high`."""
     least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
     return -jax.vmap(_largest, (1, None, None))(-least, low, high), jax.vmap(_largest, (1, None, None))(most, low, high)
 
 
 def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """max p payoff over low <= p <= high, sum p = 1: what is left goes to the largest payoffs first."""
+    """max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
     order = jnp.argsort(-payoff)
     room = (high - low)[order]
     before = jnp.cumsum(room) - room
@@ -208,7 +213,7 @@ def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
-    """A linear filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
+    """Build the filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
     start, (initial, described) = first(plant), observation_models(channel)
     return UncertainModalFilter(
         plant=plant,

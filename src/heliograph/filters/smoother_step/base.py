@@ -1,7 +1,7 @@
-"""What a filter's step leaves behind for a sweep back, and how what later data say passes back over it.
+"""Smoother step of a filter: what the backward pass needs of a forward step.
 
-A sweep starts at the last step with `end`, passes each step with `back`, and reads the estimates given all data with
-`estimate_from`; `ahead` carries one earlier state forward instead.
+A pass starts at the last step with `end`, goes back over each step with `back`, and reads the estimates given all data
+with `estimate_from`; `ahead` carries one earlier state forward instead.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Moments(NamedTuple):
 
 
 class Point(NamedTuple):
-    """An earlier state x_j given the data so far: mean and covariance; `link` tells how news of x now reach it."""
+    """Mean and covariance of an earlier state x_j given the data so far; `link` maps new information back to it."""
 
     mean: Float[jax.Array, " N"]
     covariance: Float[jax.Array, "N N"]
@@ -33,14 +33,16 @@ class Point(NamedTuple):
 
 
 class AbstractSmootherStep(Module):
-    """A step as a sweep back needs it: the estimate after it, of the filter's own state of N numbers.
+    """Smoother step: the estimate after a step, of the filter's state of N numbers, and what a backward pass needs.
 
-    The plant's state is want y + shift of the filter's state y, y itself without them. claim: of estimates given later
-    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run. angles: which of the plant's
-    states are told between -pi and pi; a sweep never wraps them. nis: e' S^-1 e of the
-    step's innovation, expected to be `received`, the number of components that arrived.
+    The plant's state is projection y + shift of the filter's state y, y itself without them. Stacked along time, and
+    over runs, it describes a whole run of a filter.
 
-    Shapes: mean (N,), covariance (N, N), want (n, N), shift (n,).
+    claim: of estimates given later data too. angles: which of the plant's states are wrapped to between -pi and pi in
+    estimates; a backward pass never wraps them. nis: e' S^-1 e of the step's innovation, with mean `received`, the
+    number of components that arrived.
+
+    Shapes: mean (N,), covariance (N, N), projection (n, N), shift (n,).
     """
 
     mean: Float[jax.Array, "*time N"]
@@ -53,46 +55,46 @@ class AbstractSmootherStep(Module):
     angles: Angles = eqx.field(static=True)
 
     def end(self) -> PyTree:
-        """At this step, if it is the last."""
+        """Start a backward pass at this step, the last."""
         raise NotImplementedError
 
     def back(self, later: PyTree, mean: jax.Array, covariance: jax.Array) -> PyTree:
-        """From after this step to before it, where the filter had this mean and covariance."""
+        """Pass from after this step to before it, where the filter had this mean and covariance."""
         raise NotImplementedError
 
     def smoothed(self, later: PyTree) -> Moments:
-        """The filter's state after this step, given later data."""
+        """Return the filter's state after this step, given later data."""
         raise NotImplementedError
 
     def ahead(self, point: Point) -> Point:
-        """An earlier state given this step's data too."""
+        """Return an earlier state given this step's data too."""
         raise NotImplementedError
 
     def before(self, item: "AbstractSmootherStep", earlier: PyTree, known: Moments) -> Moments:
-        """The state after step `item`, the one before this, given all later data.
+        """Return the state after step `item`, the one before this, given all later data.
 
-        `earlier` is what `back` makes of them; `known` is the state after this step given the same.
+        `earlier` is the result of `back`; `known` is the state after this step given the same data.
         """
         return item.smoothed(earlier)
 
     def start(self) -> Point:
-        """The state after this step as one to be carried ahead."""
+        """Return the state after this step as a point to be carried ahead."""
         n = self.mean.shape[-1]
         return Point(self.mean, self.covariance, self._link(n))
 
     def without_data(self) -> "AbstractSmootherStep":
-        """The same step without what only means depend on."""
+        """Return the same step without the parts that only means depend on."""
         raise NotImplementedError
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractSmootherStep":
-        """The same step of other data that arrived in the same places: only means and innovation are others."""
+        """Return the same step with other data of the same arrivals: other means and innovation."""
         raise NotImplementedError
 
     def _link(self, n: int) -> jax.Array:
         raise NotImplementedError
 
     def estimate_from(self, result: Moments | Point) -> Estimate:
-        """The plant's state from the filter's."""
+        """Estimate of the plant's state from the filter's."""
         mean, covariance = result.mean, result.covariance
         if self.projection is not None:
             mean, covariance = applied(self.projection, mean), _congruence(self.projection, covariance)
@@ -102,7 +104,7 @@ class AbstractSmootherStep(Module):
 
 @runs_last
 def less(p: jax.Array, factor: jax.Array, middle: jax.Array) -> jax.Array:
-    """P - F M F', known to rounding of P alone, which is added."""
+    """P - F M F', accurate to rounding of P alone, which is added."""
     return symmetric(with_rounding(p, len(p)) - congruence(factor, middle))
 
 

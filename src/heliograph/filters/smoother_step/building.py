@@ -1,4 +1,4 @@
-"""How a step comes to be retained: from the states around a correction, and what it heard."""
+"""Construction of smoother steps from the states around a correction and its innovation."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,27 +20,27 @@ from heliograph.numerics.types import Array, Float
 
 
 def with_nis(step: AbstractSmootherStep, innovation: Innovation) -> AbstractSmootherStep:
-    """The step with how much its innovation surprised the filter, in units of what it believes."""
+    """Return the step with the normalised innovation squared, e' S^-1 e."""
     nis, count = innovation_distance(innovation)
     return replace(step, nis=nis, received=count)
 
 
 class HasMoments(Protocol):
-    """A state of a filter: what it says of the mean (N,) and the covariance (N, N)."""
+    """A state of a filter with a mean (N,) and a covariance (N, N)."""
 
     @property
     def mean(self) -> Float[jax.Array, " N"]:
-        """Mean."""
+        """Mean of the state."""
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
-        """Covariance."""
+        """Covariance of the state."""
 
 
 def moments_smoother_step(
     after: HasMoments, prior: HasMoments, cross: Array, claim: Claim, angles: Angles = ()
 ) -> MomentsSmootherStep:
-    """From the states after and before a correction, and Cov(x before the step, x after its prediction)."""
+    """Build the step from the states after and before a correction, and Cov(x before the step, x predicted)."""
     return MomentsSmootherStep(
         mean=jnp.asarray(after.mean),
         covariance=jnp.asarray(after.covariance),
@@ -68,12 +68,14 @@ def linear_smoother_step(
     projection: Array | None = None,
     solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> LinearSmootherStep:
-    """From the states after and before a correction, A, Q (None: not known apart), H, e, and the gain's S.
+    """Build the step from the states after and before a correction, A, Q (None: not separately known), H, e, and S.
 
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
     component that others determine is left out.
     """
+    # H' S^-1 and K = P- H' S^-1 of the components that arrived.
     given = jnp.asarray(prior.covariance), jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    # H' S^-1 and K = P- H' S^-1 of the components that arrived.
     if solve is None:
         gain, weigh, received, innovation = _parts(*given)
     else:

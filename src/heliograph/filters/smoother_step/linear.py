@@ -1,4 +1,4 @@
-"""What a linear update leaves behind for a sweep back."""
+"""Smoother step of a linear update, by the adjoint (Bryson and Frazier) form."""
 
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,7 @@ SHARP = 1e-3  # of the filter's variance: below it P - P Lambda P leaves fewer d
 
 
 class Adjoint(NamedTuple):
-    """What later data say of the state after a step: given them it is x - P vector, of covariance P - P matrix P."""
+    """Adjoint of the state after a step: given later data it has mean x - P vector and covariance P - P matrix P."""
 
     vector: Float[jax.Array, "*time N"]
     matrix: Float[jax.Array, "*time N N"]
@@ -37,8 +37,8 @@ class Adjoint(NamedTuple):
 class LinearSmootherStep(AbstractSmootherStep):
     """A linear update: y- = A y + ..., y = y- + K e, e = z - H y- - ..., K = P- H' S^-1, nothing else inverted.
 
-    transition A, process Q (None: not known apart), gain K, output H, weigh H' S^-1, innovation e; of what did not
-    arrive nothing. With B = I - K H, lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both
+    transition A, process Q (None: not separately known), gain K, output H, weigh H' S^-1, innovation e; zero for what
+    did not arrive. With B = I - K H, lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both
     through A'.
 
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
@@ -52,11 +52,11 @@ class LinearSmootherStep(AbstractSmootherStep):
     innovation: Float[jax.Array, "*time m"]
 
     def end(self) -> Adjoint:
-        """Nothing is later."""
+        """Adjoint of zero: there are no later data."""
         return Adjoint(jnp.zeros_like(self.mean), jnp.zeros_like(self.covariance))
 
     def back(self, later: Adjoint, mean: jax.Array, covariance: jax.Array) -> Adjoint:
-        """Through the update, then through the transition."""
+        """Pass back through the update, then through the transition."""
         vector = _vector_back(later.vector, self.transition, self.gain, self.output, self.weigh, self.innovation)
         return Adjoint(vector, _matrix_back(later.matrix, self.transition, self.gain, self.output, self.weigh))
 
@@ -71,9 +71,9 @@ class LinearSmootherStep(AbstractSmootherStep):
         return Point(*_point_ahead(*point, self.transition, self.gain, self.output, self.weigh, self.innovation))
 
     def before(self, item: AbstractSmootherStep, earlier: Adjoint, known: Moments) -> Moments:
-        """P_s = (I - J A) P (I - J A)' + J (Q + P_s+) J', J = P A' (P-)^+, where P - P Lambda P loses its digits.
+        """P_s = (I - J A) P (I - J A)' + J (Q + P_s+) J', J = P A' (P-)^+, where P - P Lambda P cancels.
 
-        A sum of squares, by Rauch, Tung and Striebel with P - J P- J' in Joseph's form; one inverse more.
+        A sum of squares, by Rauch, Tung and Striebel with P - J P- J' in Joseph's form; it needs one more inverse.
         """
         if self.process is None:
             return item.smoothed(earlier)
@@ -81,12 +81,12 @@ class LinearSmootherStep(AbstractSmootherStep):
         return Moments(item.mean - applied(item.covariance, earlier.vector), _left(*given))
 
     def without_data(self) -> AbstractSmootherStep:
-        """Without mean and innovation."""
+        """Return the step without mean and innovation."""
         mean, innovation = jnp.zeros_like(self.mean), jnp.zeros_like(self.innovation)
         return replace(self, mean=mean, innovation=innovation, shift=None, nis=None, received=None)
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
-        """Mean and innovation."""
+        """Return the step with this mean and innovation."""
         return replace(self, mean=mean, innovation=innovation)
 
     def _link(self, n: int) -> jax.Array:

@@ -1,4 +1,4 @@
-"""What any update leaves behind for a sweep back: the moments around it."""
+"""Smoother step of any update, by its moments (Rauch, Tung and Striebel)."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from heliograph.numerics.types import Float
 
 
 class MomentsSmootherStep(AbstractSmootherStep):
-    """Any update: mean and covariance before it too, and cross = Cov(y before the step, y after its prediction).
+    """Any update: prior mean and covariance too, and cross = Cov(y before the step, y after its prediction).
 
     J = cross (P-)^+: y_s = y + J (y_s+ - y-), P_s = P + J (P_s+ - P-) J'. Exact where the covariances are.
 
@@ -24,17 +24,17 @@ class MomentsSmootherStep(AbstractSmootherStep):
     cross: Float[jax.Array, "*time N N"]
 
     def end(self) -> Moments:
-        """The filter's own."""
+        """Moments of the filter at the last step."""
         return Moments(self.mean, self.covariance)
 
     def back(self, later: Moments, mean: jax.Array, covariance: jax.Array) -> Moments:
-        """What was not expected of the state after the step, through J."""
+        """Pass back through J: y + J (y_s+ - y-), P + J (P_s+ - P-) J'."""
         gain = self._gain()
         news = applied(gain, later.mean - self.prior_mean)
         return Moments(mean + news, less(covariance, gain, self.prior_covariance - later.covariance))
 
     def smoothed(self, later: Moments) -> Moments:
-        """As it is."""
+        """Return the moments as they are."""
         return later
 
     def ahead(self, point: Point) -> Point:
@@ -44,12 +44,12 @@ class MomentsSmootherStep(AbstractSmootherStep):
         return Point(point.mean + news, less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
 
     def without_data(self) -> AbstractSmootherStep:
-        """Without both means."""
+        """Return the step without both means."""
         none = jnp.zeros_like(self.mean)
         return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
-        """Both means."""
+        """Return the step with these means."""
         return replace(self, mean=mean, prior_mean=prior_mean)
 
     def _link(self, n: int) -> jax.Array:

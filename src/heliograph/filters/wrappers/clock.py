@@ -1,4 +1,4 @@
-"""A filter of nodes' clocks that learns of a clock only what the data can tell."""
+"""Filter of a plant and its nodes' clocks that estimates a clock only while the data make it observable."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -27,16 +27,16 @@ from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
-SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of none tells nothing of when it was
-SHARE = 1e-3  # of what the outputs say of an offset: with less left when all other states may be anything, it is none
-RANK = 1e-12  # of the largest eigenvalue: directions below are not seen at all
+SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
+SHARE = 1e-3  # of the outputs' derivatives by an offset: with less unexplained by other states, it is unobservable
+RANK = 1e-12  # of the largest eigenvalue: directions below are unobservable
 
 
 class ClockBelief(NamedTuple):
-    """Mean and covariance of plant and clocks, the last input, since when each number was not heard, and which clocks
-    the last data could tell of.
+    """Joint mean and covariance of plant and clocks, the last input, and which clocks the last data made observable.
 
     Shapes: mean (n,), covariance (n, n), inputs (inputs,), silence (received,), observed (clocks,).
+    `silence` counts the steps since each component of z last arrived.
     """
 
     mean: Float[jax.Array, " n"]
@@ -50,14 +50,16 @@ class ClockFilter(AbstractFilter):
     """A Gaussian filter of a plant with clocks, in which a clock that cannot be observed is considered, not estimated.
 
     An offset o enters as y - o dy/dt. It is observable against another clock on the same plant, and while the plant
-    moves: of one node alone, all moved in time by o gives the same data, and at rest no time is told from another. The
-    filter linearises at estimates that differ from step to step, and would claim to know what nobody can. So at each
-    step it asks, of each clock,
+    moves: with one node alone, shifting everything in time by o gives the same data, and a plant at rest gives no
+    information on time. The filter linearises at estimates that differ from step to step, and would claim information
+    that the data do not hold. So at each step it tests, for each clock,
+
     - whether dy/dt is more than three standard deviations from 0 in some output,
     - whether, over as many steps as there are states, along the motion without noise, the derivatives by o of what is
-      heard are no combination of those by all other states; a common shift in time is one. What was silent for as many
-      steps is not heard, nor what only noise comes from.
-    If not, offset and drift keep mean and covariance, and the others are corrected as those who do not know them
+      received are linearly independent of those by all other states; a common shift in time is not. Components that
+      have not arrived for as many steps do not count, nor do those that carry noise only.
+
+    If not, offset and drift keep mean and covariance, and the other states are corrected without knowledge of them
     (Schmidt): K = 0 there, P+ = P - K C - C' K' + K S K'.
 
     Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
@@ -72,7 +74,7 @@ class ClockFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ClockBelief:
-        """The prior; no data."""
+        """Return the belief before any data."""
         mean, covariance = map(jnp.asarray, self.base.init())
         silence = jnp.full(self.received, len(self.states))
         none = jnp.zeros(len(self.offsets), dtype=bool)
@@ -80,24 +82,28 @@ class ClockFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
-        """Plant and clocks over step k."""
+        """Predict plant and clocks over step k."""
         moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
         inputs, silence = jnp.asarray(u, dtype=float), state.silence + 1
         return state._replace(mean=moved.mean, covariance=moved.covariance, inputs=inputs, silence=silence)
 
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
-        """Use what arrived of z, for those clocks alone that can be observed."""
+        """Correct with what arrived of z, leaving clocks that cannot be observed as they are."""
         base = self.base
+        # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), Belief(state.mean, state.covariance)
         signal = signal_of(at(base.plant, k), sensor, base.transform, prior)
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = nearest(jnp.asarray(z), expected, base.observed_angles)
+        # Innovation covariance S, for all components.
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
+        # Observability of each clock through the components that arrived recently.
         silence = jnp.where(present, 0, state.silence)
         arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
         observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
+        # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
         gain, _ = base.update.correct(prior.covariance, signal, channel, present)
         gain = gain * self._estimated(observed)[:, None]
         mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
@@ -113,7 +119,7 @@ class ClockFilter(AbstractFilter):
         return values
 
     def _observed(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Whether each clock can be observed."""
+        """Test whether each clock is observable: dy/dt is significant, and its derivatives are linearly independent."""
         slope = jax.jacfwd(observe)
         rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
         seen = self._alone(state, observe, k)
@@ -125,7 +131,7 @@ class ClockFilter(AbstractFilter):
         return jnp.stack(result)
 
     def _alone(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
-        """Share of the outputs' derivatives by each offset that is no combination of those by the other states."""
+        """Share of the outputs' derivatives by each offset that is independent of those by the other states."""
         plant, n = at(self.base.plant, k), len(self.states)
 
         def follow(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
@@ -139,12 +145,12 @@ class ClockFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: ClockBelief) -> Estimate:
-        """The belief, angles between -pi and pi."""
+        """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
 def _share(square: jax.Array, place: int) -> jax.Array:
-    """1 - r' R^+ r of one column of O among the others, with R = their correlations, O'O = `square`."""
+    """1 - r' R^+ r, the unexplained share of one column of O given the others, R their correlations, O'O = `square`."""
     size = jnp.sqrt(jnp.diagonal(square))
     scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
@@ -157,7 +163,7 @@ def _share(square: jax.Array, place: int) -> jax.Array:
 
 
 def _considered(prior: jax.Array, gain: jax.Array, signal: Signal, channel: SecondOrder, total: jax.Array) -> jax.Array:
-    """P - K C - C' K' + K S K', true of any gain."""
+    """P - K C - C' K' + K S K', valid for any gain."""
     used = gain @ jnp.asarray(channel.mean_gain) @ signal.cross.T
     return symmetrize(prior - used - used.T + gain @ total @ gain.T)
 
@@ -169,23 +175,31 @@ def clock_filter(
     clocks: Sequence[str],
     transform: AbstractTransform | None = None,
 ) -> ClockFilter:
-    """A filter of plant and clocks, as `with_clocks` makes them, that knows when a clock cannot be observed.
+    """Filter of plant and clocks, as `with_clocks` makes them, that detects when a clock cannot be observed.
 
-    `clocks` are the names of their nodes, `sensor` that of all nodes together (`joint_sensor`). Moments of h are those
-    of a product of Gaussians, exact where h is linear beside the clocks; another `transform` where it is not.
+    Args:
+        plant: the plant with its clocks' offsets and drifts among the states.
+        sensor: the sensor of all nodes together (`joint_sensor`), m outputs.
+        channel: the channel of all nodes together.
+        clocks: names of the nodes that have a clock.
+        transform: moments of h; `PolynomialMoments(2)` by default, those of a product of Gaussians, which are exact
+            where h is linear in the plant's states.
 
     Claim: "nominal".
 
     Raises:
         ValueError: names that are no clocks of the plant, uncertain probabilities, parts that do not fit.
+
     Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
     """
     states = check_plant(plant).states
     names = [f"{name}_offset" for name in items("clocks", clocks, "names of nodes")]
     if not names or any(name not in states for name in names):
         raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))
+    # The joint Gaussian filter, to which the test of observability is added.
     chosen = PolynomialMoments(2) if transform is None else transform
     base = gaussian_filter(plant, sensor, channel, chosen, Polytope())
+    # Schmidt's update needs the moments of the channel themselves, not bounds.
     described = jax.tree.leaves(base.channel, is_leaf=lambda part: isinstance(part, SecondOrder))
     if any(isinstance(part, SecondOrder) and part.uncertain for part in described):
         raise fail("channel of a clock filter", "known probabilities", "uncertain ones")

@@ -1,4 +1,4 @@
-"""Filters behind links that hear late: in the time of what is heard, told of it, or of all that was sent."""
+"""Filters behind delayed links: constant delays, delays known at the receiver, and lines of past signals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,7 +31,7 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, second_
 
 
 class PartFilter(AbstractFilter):
-    """A filter of a larger system that tells of its first states alone. Built by `part_filter`."""
+    """A filter of a larger system that estimates its first states alone. Built by `part_filter`."""
 
     base: AbstractFilter
     claim: Claim = eqx.field(static=True)
@@ -45,26 +45,26 @@ class PartFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """The filter's own."""
+        """Return the larger filter's initial state."""
         return self.base.init()
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """The filter's own."""
+        """Predict with the larger filter."""
         return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """The filter's own."""
+        """Correct with the larger filter."""
         return self.base.correct(state, z, k)
 
     @in_float64
     def estimate(self, state: PyTree) -> Estimate:
-        """The first states."""
+        """Mean and covariance of the first states."""
         return self._part(self.base.estimate(state))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """The first states."""
+        """Mean and covariance of the first states after step k."""
         return self._part(self.base.after_step(state, k))
 
     def _part(self, estimate_: Estimate) -> Estimate:
@@ -72,7 +72,7 @@ class PartFilter(AbstractFilter):
         return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all that does not depend on data computed before."""
+        """Precompute all that does not depend on data."""
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)
@@ -81,12 +81,17 @@ class PartFilter(AbstractFilter):
 
 
 def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
-    """The first so many states of what a filter estimates, as of a plant that was given others (`with_past`).
+    """Restrict a filter to its first states, as those of the plant in a system enlarged by `with_past`.
 
-    Claim: the filter's own.
+    Args:
+        filter: the filter of the larger system.
+        states: how many of its states are estimated, counted from the first.
+
+    Claim: that of `filter`.
 
     Raises:
         ValueError: no filter, more states than it has.
+
     Source: a part of a linear estimate is the estimate of that part.
     """
     instance("filter", filter, AbstractFilter, "a filter")
@@ -96,7 +101,7 @@ def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
 
 
 class LateState(NamedTuple):
-    """The state of the filter of the time that was last heard of, the inputs since then, and the last step."""
+    """State of the filter at the time of the last received signal, the inputs since then, and the last step."""
 
     base: PyTree
     inputs: Float[jax.Array, "delay inputs"]
@@ -104,9 +109,9 @@ class LateState(NamedTuple):
 
 
 class LateFilter(AbstractFilter):
-    """A filter behind a link that is late by a constant: it runs in the time of what it hears, and predicts to now.
+    """A filter behind a link with constant delay d: it filters at time k - d and predicts d steps ahead.
 
-    That is the best linear filter with the past as states, without its cost. Built by `late_filter`.
+    This is the best linear filter with the past as states, without its cost. Built by `late_filter`.
     """
 
     base: AbstractFilter
@@ -122,26 +127,26 @@ class LateFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> LateState:
-        """Nothing was heard of any time."""
+        """Return the state before any signal was sent."""
         start = jax.tree.map(jnp.asarray, self.base.init())
         return LateState(start, jnp.zeros((self.delay, len(self.inputs))), jnp.asarray(-1))
 
     @predicts
     def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
-        """Over step k - delay, with the input of that step."""
+        """Predict over step k - delay, with the input of that step."""
         line = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])
         then = jnp.asarray(k) - self.delay
         moved = self._moved(state.base, line[0], then)
         return LateState(moved, line[1:], jnp.asarray(k, dtype=state.step.dtype))
 
     def _moved(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Over step k, if there was one."""
+        """Predict over step k, or return the state as it is where k < 0."""
         after = self.base.predict(base, u, jnp.maximum(k, 0))
         return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
 
     @corrects
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
-        """Use what was sent at step k - delay; what is heard before anything was sent says nothing."""
+        """Correct with what was sent at step k - delay; values received before the first signal say nothing."""
         then = jnp.asarray(k) - self.delay
         observed = jnp.where(then >= 0, jnp.asarray(z), jnp.nan)
         step = jnp.maximum(then, 0)
@@ -152,7 +157,7 @@ class LateFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: LateState) -> Estimate:
-        """Predicted over the last `delay` steps."""
+        """Prediction over the last `delay` steps."""
 
         def move(j: jax.Array, base: PyTree) -> PyTree:
             return self._moved(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
@@ -161,22 +166,27 @@ class LateFilter(AbstractFilter):
 
 
 def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
-    """Any filter behind a link that is late by a constant: made for the link without delay, it filters time past.
+    """Put a filter behind a link with a constant delay: it filters the past and predicts to the present.
 
-    Claim: the filter's own, of a prediction over `delay` steps.
+    Args:
+        filter: a filter made for the link without delay.
+        delay: whole number of steps, from 0.
+
+    Claim: that of `filter`, for a prediction over `delay` steps.
 
     Raises:
         ValueError: no filter, a delay that is no whole number of steps.
-    Source: prediction from the estimate of the time last heard of; equal to augmenting the state with past signals.
+
+    Source: prediction from the last filtered time; equal to augmenting the state with past signals.
     """
     return LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
 
 
 class KnownDelayFilter(AbstractFilter):
-    """The best linear filter behind a link that tells how late each value is, as the last number that is received.
+    """The best linear filter behind a link with time stamps: the delay of each value is its last received component.
 
-    It estimates what was sent as well, so that one y heard twice is one, with two channel noises: joint noise
-    R 11' + N I. Given all delays it is the best linear estimate.
+    It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
+    noise R 11' + N I. Given all delays it is the best linear estimate.
 
     base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced by `channels` at a delay (0, ..., D).
     """
@@ -190,17 +200,17 @@ class KnownDelayFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """The prior."""
+        """Return the state before any data."""
         return self.base.init()
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Over step k, and the line moves on."""
+        """Predict over step k, and shift the line of past signals."""
         return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Use what arrived, by the link of its delay; without the delay nothing is used."""
+        """Correct with the channel of the received delay; without a delay nothing is used."""
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
         known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(known, delay, 0.0).astype(int), 0, longest)
@@ -214,7 +224,7 @@ class KnownDelayFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: PyTree) -> Estimate:
-        """The plant's states."""
+        """Mean and covariance of the plant's states."""
         n, published = len(self.states), self.base.estimate(state)
         return Estimate(published.mean[:n], published.covariance[:n, :n], self.claim)
 
@@ -223,7 +233,7 @@ Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
 def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
-    """The filter that `make` makes of links that are not late, behind those that are."""
+    """Build a filter for a link that may be late, where `make` builds it for links without delay."""
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
     if isinstance(start, Delayed) and start.timestamped:
@@ -260,7 +270,7 @@ def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
 
 
 def as_current(channel: Channel) -> Channel:
-    """The channel for those who take what is late as current: all that its line holds is y_k."""
+    """Return the channel for a filter that takes late signals as current: all signals of its line are y_k."""
     if isinstance(channel, OverTime):
         return over_time([as_current(item) for item in unstack(channel)])
     return _at_once(as_maps("channel", [channel])[0])

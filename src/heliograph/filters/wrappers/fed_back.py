@@ -1,4 +1,4 @@
-"""The filter whose prediction the sensor knows and takes off before it sends: only what is new costs power."""
+"""Filter with feedback to the sensor, which subtracts the prediction before it sends, to save power."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class FedBackBelief(NamedTuple):
-    """Mean (n,) and covariance (n, n) of the state, and what the sensor takes off y at this step, (m,)."""
+    """Mean (n,) and covariance (n, n) of the state, and the reference (m,) that the sensor subtracts from y."""
 
     mean: Float[jax.Array, " n"]
     covariance: Float[jax.Array, "n n"]
@@ -31,10 +31,17 @@ class FedBackBelief(NamedTuple):
 
 
 class FedBackFilter(AbstractFilter):
-    """It tells the sensor its estimate after each step; z = G (y - r) + n with r = h(f(xhat, u)), which both compute.
+    """Filter whose estimate is fed back to the sensor: z = G (y - r) + n with r = h(f(xhat, u)), which both compute.
 
     y - r has the mean E[y] - r, zero for a linear model, and the covariance of the innovation: that alone costs power,
-    and that alone the gain's randomness multiplies. On the way back nothing is lost.
+    and that alone the gain's randomness multiplies. The feedback link is lossless.
+
+    Args:
+        base: the filter without feedback, whose plant, sensor, channel and update are used.
+        claim: what the covariance is.
+        states: names of the plant's states.
+        inputs: names of the plant's inputs.
+        received: length of z.
     """
 
     base: GaussianFilter
@@ -44,7 +51,7 @@ class FedBackFilter(AbstractFilter):
     received: int = eqx.field(static=True)
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
-        """What is taken off y at step k, from the estimate after the step before and the input over step k."""
+        """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
         plant, sensor = at(self.base.plant, k), at(self.base.sensor, k)
         expected = plant.transition(jnp.asarray(known), jnp.asarray(u)) + plant.noise_mean()
         result: jax.Array = sensor.measure(expected) + sensor.noise.mean
@@ -52,19 +59,19 @@ class FedBackFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> FedBackBelief:
-        """The prior."""
+        """Return the belief before any data."""
         mean, covariance = map(jnp.asarray, self.base.init())
         return FedBackBelief(mean, covariance, jnp.zeros(len(first(self.base.sensor).outputs)))
 
     @predicts
     def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
-        """Mean and covariance of f(x, u) + w, and what the sensor will take off."""
+        """Mean and covariance of f(x, u) + w, and the reference that the sensor will subtract."""
         moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
         return FedBackBelief(*moved, self.reference(state.mean, jnp.asarray(u), k))
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
-        """Use the measurement of y - r."""
+        """Correct with the measurement of y - r."""
         base, prior = self.base, Belief(state.mean, state.covariance)
         y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
         left = y.mean - state.reference
@@ -75,7 +82,7 @@ class FedBackFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: FedBackBelief) -> Estimate:
-        """The belief."""
+        """Mean and covariance of the belief."""
         return Estimate(state.mean, state.covariance, self.claim)
 
 
@@ -86,16 +93,23 @@ def fed_back_filter(
     transform: AbstractTransform | None = None,
     update: AbstractUpdate | None = None,
 ) -> FedBackFilter:
-    """The filter that a sensor hears back: at each step it sends y less what the filter expects, z = G (y - r) + n.
+    """Filter whose prediction is fed back to the sensor, which sends y less that prediction: z = G (y - r) + n.
 
-    A node that has this filter is simulated so. z is what arrives, nothing added back. `transform` is `Cubature()`
-    unless given, `update` as for `cubature_filter`; a linear plant and sensor need no transform.
+    A node that has this filter is simulated so. z is what arrives, nothing added back.
+
+    Args:
+        plant: the plant; a linear plant and sensor need no transform.
+        sensor: its sensor, without angles.
+        channel: from the sensor to the filter; the feedback is lossless.
+        transform: moments of a nonlinear function; `Cubature()` by default.
+        update: as for `cubature_filter`; `Polytope()` by default.
 
     Claim: "exact" for a linear plant and sensor, however random the gains: with E[y - r] = 0 and
     E (y - r)(y - r)' = C P C' + R the best gain is K = P C' M' (M S M' + Sigma(S))^-1. Else "nominal".
 
     Raises:
         ValueError: parts that do not fit, angles.
+
     Source: Schalkwijk and Kailath, A coding scheme for additive noise channels with feedback (1966), for a state that
         moves; Elia, Remote stabilization over fading channels (2005).
     """

@@ -1,4 +1,4 @@
-"""The best linear filter behind relays that are late by chance: it estimates what each of them holds."""
+"""Best linear filter behind relays with random delays: it estimates the signals that each relay stores."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,13 +26,15 @@ from heliograph.random_affine.noise import Gaussian, Independent
 
 
 class HeldFilter(AbstractFilter):
-    """The best linear filter of (x, what was sent, what each relay heard), each as far back as it may still be heard.
+    """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
-    At each step relay i hears r = G l + n of the line l that the one before holds, whatever is forwarded later: its
-    mean M l + b, and Cov(r | l) at the unconditional moments of l.
+    Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
+    of the line l of the stage before, whatever is forwarded later: its mean is M l + b, and Cov(r | l) is taken at the
+    unconditional moments of l.
 
-    base: the filter of these states, whose plant moves all lines on by one and leaves their first places empty.
-    hears: relays' links; lines: where what each hears stands, and where it puts it, (start, length, start).
+    base: the filter of these states, whose plant shifts all lines by one and leaves their first places empty.
+    links: the relays' links. lines: for each relay the line that it receives and the place of its received signal, as
+    (start, length, place).
     """
 
     base: AbstractFilter
@@ -45,12 +47,12 @@ class HeldFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """The prior, and nothing held."""
+        """Return the prior, with empty lines."""
         return self.base.init()
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """The plant moves, the sensor sends, and one relay after another hears."""
+        """Move the plant, send the sensor's signal, and receive it at one relay after another."""
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
             state = _received_by(state, link, *line)
@@ -58,26 +60,28 @@ class HeldFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Use what arrived of z."""
+        """Correct with the components of z that arrived."""
         return self.base.correct(state, z, k)
 
     @in_float64
     def estimate(self, state: PyTree) -> Estimate:
-        """The plant's states."""
+        """Mean and covariance of the plant's states."""
         n, known = len(self.states), self.base.estimate(state)
         return Estimate(known.mean[:n], known.covariance[:n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """With all covariances and gains computed before."""
+        """Precompute all covariances and gains."""
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
 def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
-    """The moments after r at `place` is what the link makes of the line from `start` on."""
+    """Moments after r = G l + n stands at `place`, l the line of `length` from `start` on."""
+    # x+ = move x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
     here, there = slice(start, start + length), slice(place, place + m)
     move, shift = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain), jnp.zeros(total).at[there].set(offset)
+    # Cov(r | l) at the unconditional moments of l.
     mean, covariance = state.state_mean[here], state.state_covariance[here, here]
     second = homogeneous(covariance + jnp.outer(mean, mean), mean, 1.0)
     fresh = jnp.zeros((total, total)).at[there, there].set(link.spread.middle(second, jnp.ones(m, dtype=bool)))
@@ -92,13 +96,14 @@ def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, plac
 def with_relays(
     plant: AnyPlant, sensor: AnySensor, channel: Relayed
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
-    """Plant, sensor and last link of all lines, and where each relay hears and holds; the relays do not hear yet.
+    """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places.
 
     Raises:
-        ValueError: a plant or sensor that is not linear, links that remember.
+        ValueError: a plant or sensor that is not linear, links with memory.
     """
     for stage in channel.stages:
         check_forgets("link of a relay that is late by chance", stage)
+    # The sensor's line, then one line per relay behind it.
     moved, _, _ = with_past(plant, sensor, channel.stages[0])
     start, lines = len(first(plant).states), []
     total = len(first(moved).states)
@@ -110,12 +115,13 @@ def with_relays(
             moved = over_time([_holding(item, i, stage.outputs, later.past) for item in unstack(moved)])
         else:
             moved = _holding(moved, i, stage.outputs, later.past)
+    # The receiver sees the line of the last relay.
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
     return moved, last, of_line(channel.stages[-1]), tuple(lines)
 
 
 def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
-    """The plant, and a line of a relay that moves on by one."""
+    """Enlarge the plant by the line of a relay, which shifts by one at each step."""
     held, n = size * (1 + steps), len(plant.states)
     xp, none = library(plant.matrix, plant.input_matrix), Gaussian(np.zeros((held, held)))
     shift = np.kron(np.eye(1 + steps, k=-1), np.eye(size))
@@ -131,11 +137,12 @@ def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
 
 
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
-    """From the filter of all lines.
+    """Build the filter behind relays from `base`, the filter of all lines.
 
     Raises:
         ValueError: relays' links with uncertain probabilities.
     """
+    # Only the moments under known probabilities make the filter optimal.
     links = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")

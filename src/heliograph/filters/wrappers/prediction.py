@@ -1,4 +1,4 @@
-"""A filter's prediction as its estimate, so that it can be compared with filters that predict."""
+"""One-step prediction of a filter as its estimate, for comparison with filters in predictor form."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from heliograph.numerics.types import ArrayLike
 
 
 class Ahead(NamedTuple):
-    """The belief, and the prediction that it was corrected from."""
+    """Corrected belief, and the prediction before the correction."""
 
     belief: Belief
     prior: Belief
@@ -38,34 +38,35 @@ class PredictionFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> Ahead:
-        """The prior of the filter."""
+        """Return the prior of the filter, twice."""
         return Ahead(self.base.init(), self.base.init())
 
     @predicts
     def predict(self, state: Ahead, u: ArrayLike = (), k: Step = 0) -> Ahead:
-        """The filter's prediction, kept beside what z_k will make of it."""
+        """Predict with the filter; the correction will not change the stored prior."""
         prior = self.base.predict(state.belief, u, k)
         return Ahead(prior, prior)
 
     @corrects
     def correct(self, state: Ahead, z: ArrayLike, k: Step = 0) -> tuple[Ahead, Innovation]:
-        """Use what arrived of z for the next step; the estimate stays."""
+        """Correct the belief for the next step; the estimate stays the prediction."""
         belief, innovation = self.base.correct(state.belief, z, k)
         return Ahead(belief, state.prior), innovation
 
     @in_float64
     def estimate(self, state: Ahead) -> Estimate:
-        """The prediction."""
+        """Mean and covariance of the prediction."""
         return self.base.estimate(state.prior)
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:
-    """The filter's one-step prediction as the estimate: at step k it has not seen z_k.
+    """One-step prediction of a filter as its estimate: at step k it does not use z_k.
 
-    Claim: the filter's own.
+    Claim: that of `filter`, a `GaussianFilter`.
 
     Raises:
         ValueError: a filter that is not Gaussian.
+
     Source: the prediction step of cubature fusion under amplify-and-forward relays, Section III.
     """
     if not isinstance(filter, GaussianFilter):

@@ -1,4 +1,4 @@
-"""What is known of a network of linear filters before any data: how their errors are correlated, what fusion gives."""
+"""Moments of a network of linear filters before any data: cross-covariances of errors, and fused covariances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from heliograph.simulation.centres.centre import Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, plan
 
-REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative to the error: then U has an inverse
+REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 
 
 @readable
@@ -28,10 +28,18 @@ REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative 
 class CrossCovariances:
     """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.
 
-    x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the start of the plant and its
-    noise at each step) and a_i, node i's own, of covariance own_i. Biases are zero where filters believe in the world.
+    x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the initial state of the plant
+    and its noise at each step) and a_i independent between nodes, of covariance local_i. Biases are zero where the
+    filters' model is the world.
 
-    Shapes: mean (n,), state (n, sources), bias (node, n), shared (node, n, sources), own (node, n, n).
+    Args:
+        nodes: names of the nodes.
+        states: names of the plant's states.
+        mean: E x (n,).
+        state: deviation of x by sources (n, sources).
+        bias: E e_i (node, n).
+        shared: part of e_i by sources (node, n, sources).
+        local: covariance of the rest of e_i (node, n, n).
     """
 
     nodes: tuple[str, ...]
@@ -58,20 +66,20 @@ class CrossCovariances:
         return np.asarray(self.state @ self.state.T)
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
-        """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
+        """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
         weights = _weights(self.shared, self.local)
         shared, local = _weighted(weights, self.shared, self.local)
         return weights, shared @ shared.T + local
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
-        """Relays that forward the matrix-weighted estimate of the nodes each hears, as the nodes of the next level.
+        """Moments at relays that forward the matrix-weighted estimate of their nodes, as the nodes of the next level.
 
-        An error W e is a linear map of the nodes' errors, so what it shares with others is W shared, and W own W' is
-        its own as long as no two relays hear the same node. Known means of the errors are taken off. A tree of any
-        depth is this again and again; its root is `matrix_weights` of the last level.
+        An error W e is a linear map of the nodes' errors, so its sources are W shared, and the rest has covariance
+        W local W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply it
+        level by level for a deeper tree; its root is `matrix_weights` of the last level.
 
         Raises:
-            ValueError: no relays, a relay that hears nobody, unknown nodes, a node that two relays hear.
+            ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.
         """
         received = [name for names in relays.values() for name in names]
         unknown = sorted(set(received) - set(self.nodes))
@@ -81,6 +89,7 @@ class CrossCovariances:
             raise fail(
                 "nodes", "one relay for each", f"several for {sorted({n for n in received if received.count(n) > 1})}"
             )
+        # Weights of each relay's nodes, and the moments of its error.
         place = {name: i for i, name in enumerate(self.nodes)}
         parts = []
         for names in relays.values():
@@ -102,7 +111,7 @@ def _weights(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "n node
 def _weighted(
     weights: np.ndarray, shared: np.ndarray, local: np.ndarray
 ) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
-    """What a weighted sum of the errors shares with others, and the covariance of its own part."""
+    """Sources of a weighted sum of the errors, and the covariance of its independent part."""
     return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, local, weights)
 
 
@@ -114,16 +123,23 @@ def _joint(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "node n n
     return result
 
 
-def cross_covariances(network: Network, filter: str, horizon: int, inputs: ArrayLike | None = None) -> CrossCovariances:
-    """How the errors of the filters of this name are correlated after `horizon` steps of complete data.
+def cross_covariances(
+    network: Network, filter: str, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
+) -> CrossCovariances:
+    """Compute how the errors of the filters of this name are correlated after `horizon` steps of complete data.
 
     P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
-    what a filter wrongly believes of the world enters too.
+    errors of a filter's model enter too.
 
-    Shapes: inputs (horizon, inputs).
+    Args:
+        network: a network of linear filters.
+        filter: name of the filter, at every node that has it.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
-        ValueError: a network that is not linear, filters whose gains depend on data, channels that remember.
+        ValueError: a network that is not linear, filters whose gains depend on data, channels with memory.
+
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     instance("network", network, Network, "a Network")
@@ -137,11 +153,14 @@ def cross_covariances(network: Network, filter: str, horizon: int, inputs: Array
 
 
 def fused_covariances(
-    network: Network, horizon: int, inputs: ArrayLike | None = None
+    network: Network, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
-    """The covariances of the network's informed fusions, by name, for complete data.
+    """Covariances (time, n, n) of the network's informed fusions, by name, for complete data.
 
-    Shapes: inputs (horizon, inputs).
+    Args:
+        network: a network with informed fusions of linear filters.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Raises:
         ValueError: a network without an informed fusion.
@@ -154,7 +173,7 @@ def fused_covariances(
 
 
 def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
-    """Filters planned for the inputs."""
+    """Plan the filters for the inputs."""
     network.check_horizon(check_horizon(horizon))
     u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(network.inputs)))
     filters = AllFilters(network)

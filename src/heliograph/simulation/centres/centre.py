@@ -1,4 +1,4 @@
-"""A fusion centre that knows the network: it carries the joint moments of the local errors along, before any data."""
+"""Fusion centre that knows the network: it propagates the joint moments of the local errors, before any data."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -38,13 +38,13 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, second_
 
 
 class Listening(Module):
-    """Sensors and channels of nodes of one structure, stacked; each node has its own, and they share nothing."""
+    """Sensors and channels of nodes of one structure, stacked; the nodes share none of them."""
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
-        """What a plant with these moments lets the nodes hear at step k, with rows of zeros up to `size`."""
+        """Moments of the nodes' measurements at step k for a plant with these moments, zero rows up to `size`."""
 
         def single(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
             return _linear_observation(at(sensor, k), at(channel, k), mean, covariance)
@@ -63,7 +63,7 @@ class Listening(Module):
 def _linear_observation(
     sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
 ) -> Observation:
-    """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and what the gain adds."""
+    """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and the spread of the gain."""
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean
     second = homogeneous(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
@@ -73,10 +73,10 @@ def _linear_observation(
 
 
 class AbstractObservation(Module):
-    """What the nodes hear of the plant, in the nodes' order, with rows of zeros up to the longest measurement."""
+    """Measurement model of all nodes, in the nodes' order, padded with zero rows to the longest measurement."""
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """At step k, when the plant has these moments."""
+        """Moments of the measurements at step k, for a plant with these moments."""
         raise NotImplementedError
 
 
@@ -88,20 +88,20 @@ class Apart(AbstractObservation):
     size: int = eqx.field(static=True)
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Group after group."""
+        """Moments of the measurements, group after group."""
         parts = [item.observe(mean, covariance, k, self.size) for item in self.groups]
         return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
 class Together(AbstractObservation):
-    """One sensor and one channel, of which each node hears some `rows`; -1 stands for none."""
+    """Common sensor and channel, of whose outputs each node receives some `rows`; -1 stands for none."""
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
     rows: np.ndarray
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """The rows of each node, and how their noises are correlated."""
+        """Moments of the rows of each node, and the cross-covariance of their noises."""
         gain, offset, noise = _linear_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
@@ -133,20 +133,20 @@ class Centre(Module):
     read = staticmethod(linear_step)
 
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
-        """Before the first step, from the means at which each source's filters start."""
+        """Return the state before the first step, from the initial means of each source's filters."""
         plant = at(self.plant, 0)
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
     def moved(self, errors: Errors, local: Plan, u: jax.Array, k: jax.Array) -> Happened:
-        """What happens at step k to errors of filters with these matrices, in the order of the nodes."""
+        """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
         motion, step, noise = self.moves(errors.mean, errors.covariance, local, u, k)
         return Happened(motion, step, noise, advance(errors, step, motion, noise))
 
     def moves(
         self, mean: jax.Array, covariance: jax.Array, local: Plan, u: jax.Array, k: jax.Array
     ) -> tuple[Motion, ErrorStep, Array]:
-        """How plant and errors move at step k, and the noise of what is heard, for a plant with these moments."""
+        """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
@@ -154,7 +154,7 @@ class Centre(Module):
         return motion, error_step(local, motion, observation), observation.noise
 
     def gathered(self, parts: Sequence[Plan]) -> Plan:
-        """Matrices of the sources' filters in the order of the nodes, with rows of zeros for what is not heard."""
+        """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
 
         def padded(plan: Plan) -> Plan:
             more = (0, self.size - plan.offset.shape[-1])
@@ -172,7 +172,7 @@ class Centre(Module):
     def step(
         self, state: CentreState, parts: Sequence[Plan], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
     ) -> tuple[CentreState, dict[str, Estimate]]:
-        """Next state, and estimates by the fusions' names, from the sources' matrices and means after the step."""
+        """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
         happened = self.moved(state.errors, self.gathered(parts), u, k)
         reports = jnp.concatenate(means)[self.order]
         after, results = {}, {}
@@ -183,12 +183,12 @@ class Centre(Module):
 
 
 def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Listening:
-    """Nodes of one structure."""
+    """Stack nodes of one structure."""
     return Listening(stack(list(sensors)), stack([described(channel) for channel in channels]))
 
 
 def described(channel: Channel) -> SecondOrder | OverTime:
-    """The channel's second moments where all of it arrives, for each step where it varies."""
+    """Second moments of the channel where all of it arrives, for each step where it varies."""
     if isinstance(channel, OverTime):
         return over_time([second_order(arrived(item)) for item in unstack(channel)])
     return second_order(arrived(channel))
@@ -198,9 +198,9 @@ Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
 
 
 def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
-    """What fusion by an informed rule claims: "exact", "nominal" where a law is not known or filters are not linear.
+    """Claim of fusion by an informed rule: "exact", "nominal" where a law is not known or filters are not linear.
 
-    `shared`: whether the nodes hear parts of one channel.
+    `shared`: whether the nodes receive parts of one channel.
 
     Raises:
         ValueError: naming the knowledge that is missing.
@@ -218,7 +218,7 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
 
 
 def along_estimates(nodes: Parts) -> bool:
-    """Whether errors can only be followed along the estimates: some filter's gains depend on data."""
+    """Test whether errors can only be propagated along the estimates: some filter's gains depend on data."""
     return any(isinstance(item, GaussianFilter) and not item.linear for _, _, item in nodes.values())
 
 
@@ -245,10 +245,10 @@ def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
 
 
 def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
-    """What is left of a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
+    """Lower a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
 
     Raises:
-        ValueError: nodes that lose measurements, of which a report that does not come cannot tell.
+        ValueError: nodes that lose measurements, which the centre cannot know from a missing report.
     """
     lossy = [name for name, receives_all in complete.items() if not receives_all]
     if lossy:
@@ -262,7 +262,7 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 
 
 def _uncertain(channel: Channel) -> bool:
-    """Whether probabilities of the channel's laws are known up to a radius only."""
+    """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
         return any(arrived(item).corner_count() > 1 for item in _steps_of(channel))
     except ValueError:  # too many corners to list

@@ -1,4 +1,4 @@
-"""The fusion centre as a filter: it hears the nodes' reports, and knows before any data how their errors move."""
+"""Fusion centre as a filter: its measurements are the nodes' reports, and it propagates the moments of their errors."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class CentreState(NamedTuple):
-    """The nodes' filters, of which only covariances count; moments of their errors; what the reports told."""
+    """States of the nodes' filters, of which only covariances matter; moments of their errors; the estimate."""
 
     nodes: PyTree
     errors: Errors
@@ -30,10 +30,11 @@ class CentreState(NamedTuple):
 
 
 class CentreFilter(AbstractFilter):
-    """`AllReports` as a filter that hears the reports, for whatever reaches the centre: streams, recordings, runs.
+    """Filter form of `AllReports`, whose measurement is the reports: for streams, recordings and simulated runs.
 
-    It hears, of each age in steps and each node in turn, what arrived of the report: NaN for what did not.
-    `rows`: their places among (age, node, m). Local filters are followed without data: their gains depend on none.
+    The measurement is, for each age in steps and each node in turn, the part of the report that arrived: NaN for a
+    report that did not. `rows`: their places among (age, node, m). Local filters are propagated without data: their
+    gains depend on none.
     """
 
     filters: "AllFilters"
@@ -49,14 +50,14 @@ class CentreFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> CentreState:
-        """Nothing is heard yet."""
+        """Return the state before any report."""
         local, _, _, known, _ = self.filters.init()
         errors = known[0].errors
         return CentreState(local, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
 
     @predicts
     def predict(self, state: CentreState, u: ArrayLike = (), k: Step = 0) -> CentreState:
-        """The plant and all errors move; the nodes send."""
+        """Predict plant and all errors; the nodes send their reports."""
         (centre,), u, step = self.filters.informed, jnp.asarray(u), jnp.asarray(k)
         local: Plan = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
         happened = centre.moved(state.errors, local, u, step)
@@ -65,7 +66,7 @@ class CentreFilter(AbstractFilter):
 
     @corrects
     def correct(self, state: CentreState, z: ArrayLike, k: Step = 0) -> tuple[CentreState, Innovation]:
-        """Use the reports that arrived."""
+        """Correct with the reports that arrived."""
         nodes = state.known.past.gain.shape[1]
         everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[self.rows].set(jnp.asarray(z))
         known, expected = receive_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
@@ -74,5 +75,5 @@ class CentreFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: CentreState) -> Estimate:
-        """The best linear estimate of the plant's state."""
+        """Best linear estimate of the plant's state."""
         return Estimate(*fused_estimate(state.known, len(self.states)), self.claim)

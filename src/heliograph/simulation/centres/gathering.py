@@ -1,4 +1,4 @@
-"""What is made of the nodes' estimates: fusions side by side, reports, and what centres know of the nodes."""
+"""Fusion of the nodes' estimates inside a step: rules in parallel, reports, and the centres' knowledge of the nodes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -36,7 +36,7 @@ from heliograph.simulation.side_by_side import over_all, started
 class Fused(Module):
     """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
 
-    `sources` of each fusion: kind and filter whose nodes' estimates it takes, one group after another; `order` of each
+    `sources` of each fusion: kind and filter of the estimates that it fuses, one group after another; `order` of each
     (fusion, node) brings them into the order of the nodes.
     """
 
@@ -49,7 +49,7 @@ class Fused(Module):
     angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
-        """States of the quantizers."""
+        """Return the initial states of the quantizers."""
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
@@ -58,16 +58,19 @@ class Fused(Module):
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
     ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
-        """Fuse what the filters told, (filter, node, ...) of each kind: estimates and uplinks by the fusions' names."""
+        """Fuse the filters' estimates, (filter, node, ...) of each kind: estimates and uplinks by fusion."""
+        # Means and covariances in the order of each fusion's nodes.
         means = self._gathered([e.mean for e in estimates])
         covariances = self._gathered([e.covariance for e in estimates])
         uplinks: dict[str, PyTree] = {}
+        # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
             send = eqx.filter_vmap(lambda q, s, mean: at(q, k).step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
             states, sent = eqx.filter_vmap(send, in_axes=(eqx.if_array(0), 0, 0))(self.quantizers, states, means)
             means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
+        # Angles near those of the first node, then the rules in parallel.
         means = nearest(means, means[:, :1], self.angles)
         combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
         mean, covariance = combine(self.rules, means, covariances)
@@ -76,7 +79,7 @@ class Fused(Module):
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
     def _gathered(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
-        """(fusion, node, ...)."""
+        """Gather the sources' values as (fusion, node, ...)."""
         joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
             return jnp.stack(joined)
@@ -84,7 +87,7 @@ class Fused(Module):
 
 
 class Reporting(Module):
-    """A fusion that hears reports: what happens to them on their way, and the filter at the centre.
+    """A fusion by reports: their uplinks, and the filter at the centre.
 
     `sources` and `order` as in `Centre`.
     """
@@ -96,13 +99,13 @@ class Reporting(Module):
     nodes: tuple[str, ...] = eqx.field(static=True)
 
     def init(self) -> tuple[Flying, PyTree]:
-        """Nothing is on its way, nothing heard."""
+        """Return the state before any report is sent."""
         return self.uplinks.init(), started(self.centre)
 
     def step(
         self, state: tuple[Flying, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
     ) -> tuple[tuple[Flying, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
-        """Send the nodes' means, and hear what arrives: state, estimate, traffic, what becomes of what is sent when."""
+        """Send the nodes' means, and use what arrives: state, estimate, traffic, and each report with its delay."""
         flying, known = state
         means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
         flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
@@ -112,7 +115,7 @@ class Reporting(Module):
 
 
 def fusions_of(network: Network) -> tuple[Fused, ...]:
-    """The network's fusions, those of one structure together."""
+    """Fusions of the network, those of one structure stacked."""
     alike: dict[object, list[str]] = {}
     for name, item in network.fused.items():
         if isinstance(item, Fusion) and not isinstance(item.rule, AbstractInformedFusion):
@@ -125,10 +128,11 @@ def fusions_of(network: Network) -> tuple[Fused, ...]:
 def _fused(
     network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
 ) -> Fused:
-    """Where the estimates of fusions stand."""
+    """Stack fusions of one structure, with the places of the estimates that they fuse."""
     items = [item for item in (network.fused[name] for name in names) if isinstance(item, Fusion)]
     nodes = [network.nodes_with(item.filter) for item in items]
     sources, order = [], []
+    # Kinds and filters of the sources, and the order of the nodes in them.
     for item, mine in zip(items, nodes, strict=True):
         source = tuple({places[node, item.filter][:2]: None for node in mine})
         results = {
@@ -136,6 +140,7 @@ def _fused(
         }
         sources.append(source)
         order.append([results[node] for node in mine])
+    # Numbers of all fusions along a leading axis.
     quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
     rules = stack([item.rule for item in items])
     angles = first(network.plant).angles
@@ -143,7 +148,7 @@ def _fused(
 
 
 def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
-    """One for the informed fusions of each filter."""
+    """Centres of the network, one for the informed fusions of each filter."""
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, item in network.fused.items():
         if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion) and not item.by_report:
@@ -152,13 +157,15 @@ def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
 
 
 def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
-    """What the centre knows of the nodes that have the filter `name`."""
+    """Build the centre for the nodes that have the filter `name`."""
     places, claims = network.places(), network.claims()[FUSED]
     mine = network.nodes_with(name)
+    # Places of the nodes' filters, and the longest measurement.
     sources, order = gathering(network, places, mine, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     size = max(network.nodes[node].received for node in mine)
     claim = claims[next(iter(rules))]
+    # Gains that depend on data: moments along the estimates.
     if along_estimates(network.parts_of(name)):
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return Centre(
@@ -175,7 +182,7 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
 def gathering(
     network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Kinds and filters that hold the nodes' estimates, and what brings these into the order of the nodes."""
+    """Kinds and filters that hold the nodes' estimates, and the permutation of these into the order of the nodes."""
     sources = tuple({places[node, name][:2]: None for node in nodes})
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     results = {node: i for i, node in enumerate(node for names in groups for node in names)}
@@ -185,7 +192,7 @@ def gathering(
 def _observe(
     network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
 ) -> AbstractObservation:
-    """What a centre knows of how these nodes hear."""
+    """Measurement model of these nodes for a centre."""
     if network.common is not None:
         rows = network.rows()
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]

@@ -1,4 +1,4 @@
-"""A fusion centre of filters that are not linear: their errors' covariances along what the centre knows."""
+"""Fusion centre of nonlinear filters: cross-covariances of their errors, linearised along the centre's estimate."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from heliograph.numerics.types import Array, PyTree
 
 
 class Followed(NamedTuple):
-    """Of one fusion: moments of the errors, what it told last, and its rule's state."""
+    """State of one fusion: moments of the errors, its last estimate, and its rule's state."""
 
     errors: Errors
     known: jax.Array
@@ -28,12 +28,12 @@ class Followed(NamedTuple):
 
 
 class LinearisedCentre(Module):
-    """As `Centre`, of filters whose gains depend on data: nominal, as they are.
+    """A `Centre` of filters whose gains depend on data; its claim is nominal, as theirs are.
 
     P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i C_i: K_i and C_i are derivatives of each filter's
-    own step, S_ij = 0, and S_ii is what its innovation's covariance has beyond C_i P_i C_i'. A is one for all, the
-    plant's derivative at what the fusion told last: with each filter's own, nodes that share an error would seem to
-    differ by what only their linearisations do, and weights of such differences claim what is not there.
+    step, S_ij = 0, and S_ii is the innovation covariance less C_i P_i C_i'. A is common, the plant's derivative at the
+    fusion's last estimate: with each filter's A, nodes that share an error would seem to differ by their linearisations
+    alone, and weights of such differences claim information that is not there.
     """
 
     plant: AnyPlant
@@ -46,7 +46,7 @@ class LinearisedCentre(Module):
     read = staticmethod(linearised_step)
 
     def init(self, starts: Sequence[jax.Array]) -> dict[str, Followed]:
-        """Before the first step, from the means at which each source's filters start."""
+        """Return the state before the first step, from the initial means of each source's filters."""
         plant = at(self.plant, 0)
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         mean = jnp.asarray(plant.initial_mean)
@@ -60,16 +60,19 @@ class LinearisedCentre(Module):
         u: jax.Array,
         k: jax.Array,
     ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
-        """Next state, and estimates by the fusions' names, from the sources' matrices and means after the step."""
+        """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
         local, reports = self._gathered(parts), jnp.concatenate(means)[self.order]
+        # I - K_i C_i of all nodes.
         plant = at(self.plant, k)
         keep = jnp.eye(reports.shape[-1]) - local.gain @ local.output
         following, results = {}, {}
         for name, rule in self.rules.items():
             before = state[name]
+            # Common linearisation at the fusion's last estimate.
             matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
+            # Moments of the errors; the rule weights the reports by them.
             step = _shared_step(matrix, keep, local.gain)
             errors = _advanced(before.errors, step, motion.noise, local.noise)
             if isinstance(rule, AllReports):
@@ -79,7 +82,7 @@ class LinearisedCentre(Module):
         return following, results
 
     def _gathered(self, parts: Sequence[Linearised]) -> Linearised:
-        """In the order of the nodes, with rows of zeros for what is not heard."""
+        """Gather the matrices in the order of the nodes, padded with zeros to the longest measurement."""
 
         def padded(item: Linearised) -> Linearised:
             more = (0, self.size - item.gain.shape[-1])
@@ -94,20 +97,20 @@ class LinearisedCentre(Module):
 
 
 def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:
-    """e+ = F_i (A e + w) - K_i nu: errors without a mean of their own stay so."""
+    """e+ = F_i (A e + w) - K_i nu: errors of mean zero keep it."""
     nothing = jnp.zeros_like(keep)
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
 
 
 def _nis(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
-    """F_i (E e_i- - A E e_i): what each filter predicts is known, so that E e_i- = E x- - m_i-."""
+    """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - local.predicted - before @ matrix.T)
 
 
 def _advanced(errors: Errors, step: ErrorStep, noise: Array, received: Array) -> Errors:
-    """All pairs at once; moments of the plant itself are not known."""
+    """Propagate the moments of all pairs; moments of the plant itself are not known."""
     once = jnp.einsum("iab,ibjc->iajc", step.transition, errors.joint)
     both = jnp.einsum("iajb,jcb->iajc", once, step.transition)
     shared = jnp.einsum("iab,bc,jdc->iajd", step.of_noise, noise, step.of_noise)

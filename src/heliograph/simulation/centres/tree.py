@@ -1,4 +1,4 @@
-"""Trees of relays over very many nodes alike but for their numbers, at a cost linear in nodes."""
+"""Trees of relays over very many nodes that differ in numbers alone, at a cost linear in nodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,9 +34,13 @@ BLOCK = 1000  # nodes that are followed together
 class RelayTree:
     """A tree whose leaves are filters, whose relays forward the matrix-weighted estimate of those below, to a root.
 
-    covariances: of the errors at each level, from the leaves (nodes, n, n) to the root (1, n, n); weights: of each
-    level above the leaves, (relay, n, child, n), zero for children that the last relay has not. Relay r hears the
-    children r d, ..., r d + d - 1 of the level below, d the degree.
+    Relay r receives the children r d, ..., r d + d - 1 of the level below, d the degree.
+
+    Args:
+        degree: number d of children of a relay.
+        claim: claim of the fused covariances.
+        covariances: of the errors at each level, from the leaves (nodes, n, n) to the root (1, n, n).
+        weights: of each level above the leaves, (relay, n, child, n), zero for children that the last relay lacks.
     """
 
     degree: int
@@ -50,10 +54,10 @@ class RelayTree:
         return np.asarray(self.covariances[-1][0])
 
     def fused(self, estimates: ArrayLike) -> Float[np.ndarray, "... n"]:
-        """The root's estimate from those of the leaves, (..., node, n): for filters that believe in the world.
+        """Estimate of the root from those of the leaves, (..., node, n), for filters whose model is the world.
 
         Raises:
-            ValueError: as many estimates as there are leaves are wanted, with leading axes as you like.
+            ValueError: another number of estimates than of leaves; leading axes are free.
         """
         nodes, n, _ = self.covariances[0].shape
         values = np.asarray(estimates, dtype=float)
@@ -73,25 +77,32 @@ def relay_tree(
     numbers: PyTree,
     degree: int,
     horizon: int,
-    inputs: ArrayLike | None = None,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> RelayTree:
-    """What each place of a tree of relays knows after `horizon` steps of complete data, before any data.
+    """Covariances and weights of a tree of relays after `horizon` steps of complete data, before any data.
 
-    `node(one)` makes a leaf, a `Node` with one linear filter of the plant, of its numbers; it is traced by JAX.
-    `numbers` holds those of all leaves, with a leading axis. Every relay hears `degree` neighbours of the level below
-    (the last one may hear fewer) and forwards their matrix-weighted estimate. Time and memory are linear in leaves.
+    Time and memory are linear in leaves.
+
+    Args:
+        plant: a linear plant.
+        node: `node(one)` makes a leaf, a `Node` with one linear filter of the plant, from its numbers; traced by JAX.
+        numbers: numbers of all leaves, with a leading axis.
+        degree: number of neighbours of the level below that a relay receives (the last one may have fewer), from 2. It
+            forwards their matrix-weighted estimate.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
 
     Claim: "exact"; "nominal" where probabilities are uncertain.
 
-    Shapes: inputs (horizon, inputs).
-
     Raises:
         ValueError: numbers without a common leading axis, a degree below two, leaves that fusion refuses.
+
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     check_count("degree of a tree", degree, 2)
     count, steps = _count(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
+        # One leaf stands for the structure of all.
         leaf = instance("leaf", node(_slice(numbers, 0)), Node, "a Node")
         if len(leaf.filters) != 1:
             raise fail("leaf", "a Node with one filter", f"{len(leaf.filters)} filters")
@@ -99,11 +110,13 @@ def relay_tree(
         alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         alone.check_horizon(steps)
         u = array("inputs", np.zeros((steps, 0)) if inputs is None else inputs, (steps, len(alone.inputs)))
+        # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
         parts = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
         covariances, weights, level = (list(leaves) for leaves in zip(*parts, strict=True))
         known, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
+        # Level by level up to the root.
         while True:
             known.append(np.asarray(_spread(shared)))
             if len(known[-1]) == 1:
@@ -115,7 +128,7 @@ def relay_tree(
 
 
 class Level(NamedTuple):
-    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = own_i."""
+    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = local_i."""
 
     shared: Float[Array, "node n sources"]
     local: Float[Array, "node n n"]
@@ -125,8 +138,9 @@ class Level(NamedTuple):
 def _followed(
     leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
 ) -> tuple[Array, Array, Level]:
-    """Leaves of one block: covariances of their errors, the weights of the relays above, and these as nodes."""
+    """Propagate the leaves of one block: covariances of their errors, weights of the relays above, and these."""
     plant, name, node, degree = leaf
+    # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
     channels = eqx.filter_vmap(lambda item: described(node(item).channel))(numbers)
@@ -143,11 +157,13 @@ def _followed(
         motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
         return (alike.step(separate, quiet, u_k, k)[0], advance_factors(factors, step, motion, noise, k)), None
 
+    # Errors by their sources, over the horizon.
     state = alike.init()
     n = len(first(plant).states)
     begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
     result: Factors = jax.lax.scan(body, (state, begin), (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
     level = Level(result.shared, result.local)
+    # Full relays at once, then the last one.
     full = count - count % degree
     weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
     if count > full:
@@ -160,7 +176,7 @@ def _followed(
 
 @quickly_compiled
 def _relay(children: Level) -> tuple[jax.Array, Level]:
-    """Weights of a relay for its children, and its own error."""
+    """Weights of a relay for its children, and the error of its estimate."""
     return _fuse(children)
 
 

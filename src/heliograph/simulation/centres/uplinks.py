@@ -1,4 +1,4 @@
-"""The uplinks of a fusion that hears reports: what a node sends is quantized, drawn into the air, and may be late."""
+"""Uplinks of a fusion by reports: quantizers, random channels and delays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from heliograph.simulation.draws import CHANNEL, checksum, draw_key
 
 
 class Drawn(NamedTuple):
-    """What happens to the reports of a step: z = G m + n, NaN where lost, heard `delay` steps later.
+    """Draws of the uplinks at one step: z = G m + n, NaN where lost, received `delay` steps later.
 
-    Shapes: gain (node, m, n), offset (node, m), NaN in rows that a node has not, delay (node,).
+    Shapes: gain (node, m, n), offset (node, m), NaN in rows that a node lacks, delay (node,).
     """
 
     gain: Array
@@ -36,9 +36,11 @@ class Drawn(NamedTuple):
 
 @readable
 class SentReports(NamedTuple):
-    """What became of a node's reports, by the step at which they were sent, and how many steps later they arrived.
+    """Received values of a node's reports, by the step at which they were sent, and their delays in steps.
 
-    Shapes: values (..., time, m), NaN where a report never arrived, delay (..., time).
+    Args:
+        values: (..., time, m), NaN where a report never arrived.
+        delay: (..., time).
     """
 
     values: ArrayLike
@@ -46,7 +48,7 @@ class SentReports(NamedTuple):
 
 
 class Flying(NamedTuple):
-    """Reports on their way, by the steps since they were sent, from one; and the delay of each. Quantizers' states."""
+    """Reports in transit, by the steps since they were sent, from one; their delays; and the quantizers' states."""
 
     values: jax.Array
     delays: jax.Array
@@ -64,7 +66,7 @@ class Group(Module):
 class Uplinks(Module):
     """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
 
-    Shapes: delay (node, ages), every (node,). `links`: what a centre knows of them.
+    Shapes: delay (node, ages), every (node,). `links`: the centre's model of them.
     """
 
     groups: tuple[Group, ...]
@@ -77,12 +79,12 @@ class Uplinks(Module):
 
     @property
     def rows(self) -> np.ndarray:
-        """Places of what may arrive among (age, node, m) in a row."""
+        """Places of the numbers that may arrive among (age, node, m) flattened."""
         there = np.arange(max(self.received)) < np.array(self.received)[:, None]
         return np.flatnonzero(np.broadcast_to(there, (self.delay.shape[1], *there.shape)))
 
     def init(self) -> Flying:
-        """Nothing is on its way."""
+        """Return the state with no report in transit."""
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)
         begin = eqx.filter_vmap(lambda q: q.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes)
@@ -90,11 +92,13 @@ class Uplinks(Module):
         return Flying(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
 
     def draw(self, key: jax.Array, k: jax.Array) -> Drawn:
-        """What happens to the reports of step k in the run with this key; alike for all fusions of the same nodes."""
+        """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes."""
         nodes, m, n = len(self.received), max(self.received), self.n
+        # Lossless links, where nothing is random.
         gain = jnp.zeros((nodes, m, n)) if self.groups else jnp.tile(jnp.eye(n), (nodes, 1, 1))
         offset = jnp.where(np.arange(m) < np.array(self.received)[:, None], 0.0, jnp.nan)
         delay = self.fixed_delay
+        # Channels and delays, independently for each node.
         for group in self.groups:
             places = jnp.asarray(group.places)
 
@@ -111,17 +115,18 @@ class Uplinks(Module):
         return Drawn(gain, offset, delay)
 
     def undrawn(self) -> Drawn:
-        """What happens where nothing is left to chance."""
+        """Return gains, offsets and delays of deterministic links."""
         nodes = len(self.received)
         return Drawn(np.tile(np.eye(self.n), (nodes, 1, 1)), np.zeros((nodes, self.n)), self.fixed_delay)
 
     def recorded(
         self, name: str, nodes: Sequence[str], reports: Mapping[str, SentReports | ArrayLike] | None, steps: int
     ) -> Drawn:
-        """What happened to the reports of each step, from a recording; (time, node, ...).
+        """Return gains, offsets and delays of each step from a recording; (time, node, ...).
 
         Raises:
-            ValueError: nodes without reports or the reverse, shapes that do not fit, delays that the links have not.
+            ValueError: nodes without reports or the reverse, shapes that do not fit, delays that the links do not
+                allow.
         """
         count, m = len(self.received), max(self.received)
         if reports is None and not self.groups:
@@ -129,6 +134,7 @@ class Uplinks(Module):
         if reports is None or set(reports) != set(nodes):
             result = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", result)
+        # Received values as offsets, with gains of zero.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
             sent, local = reports[node], self.received[i]
@@ -147,19 +153,22 @@ class Uplinks(Module):
 
     @property
     def fixed_delay(self) -> jax.Array:
-        """The likeliest number of steps of each node, which is the only one where it is fixed."""
+        """Most probable delay of each node, which is the only one where it is fixed."""
         return jnp.argmax(jnp.asarray(self.delay), axis=1)
 
     def send(
         self, state: Flying, means: jax.Array, drawn: Drawn, k: jax.Array
     ) -> tuple[Flying, jax.Array, dict[str, jax.Array]]:
-        """Next state, what became of the reports of step k (node, m), whenever they arrive, and their traffic.
+        """Send the reports of step k: next state, received values (node, m), whenever they arrive, and their traffic.
 
-        What a quantizer cannot reach becomes an infinite number: nothing is known of it, and the estimate says so.
+        A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
+        that.
         """
+        # Only every d-th step sends.
         sending = jnp.asarray((k + 1) % self.every == 0)[:, None]
         values, traffic = jnp.where(sending, means, jnp.nan), {}
         beyond = jnp.zeros(len(means), dtype=bool)
+        # Quantized reports; an infinite number stands for one that saturated.
         if self.quantizers is not None:
             item = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
             quantizers, sent = item(self.quantizers, state.quantizers, values)
@@ -170,7 +179,7 @@ class Uplinks(Module):
         return state, jnp.where(beyond[:, None], jnp.inf, z), traffic
 
     def arrive(self, state: Flying, sent: jax.Array, delay: Array) -> tuple[Flying, jax.Array]:
-        """Next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
+        """Return the next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
         values = jnp.concatenate([sent[None], state.values])
         delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])
         due = delays == np.arange(len(values))[:, None]
@@ -178,14 +187,16 @@ class Uplinks(Module):
 
 
 def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
-    """The uplinks of these nodes to a centre that hears reports of n numbers."""
+    """Build the uplinks of these nodes to a centre that receives reports of n numbers."""
     mine, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
     ages = max(len(link.delay) for link in mine)
     channels = [perfect(n) if link.channel is None else link.channel for link in mine]
+    # Random channels by structure; none where all links are deterministic.
     groups: dict[object, list[int]] = {}
     if any(link.channel is not None or np.max(link.delay) < 1 for link in mine):
         for i, channel in enumerate(channels):
             groups.setdefault(structure(channel), []).append(i)
+    # Received numbers of each node, and bounds on the quantizers' errors.
     received = tuple(link.received(n) for link in mine)
     error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
     return Uplinks(
@@ -207,7 +218,7 @@ def _group(channels: Sequence[Channel], names: Sequence[str], places: Sequence[i
 
 
 def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
-    """What a centre knows of the uplinks, at each step if any varies."""
+    """Model of the uplinks for a centre, at each step if any varies."""
     varying = [item.steps for item in known if isinstance(item, OverTime)]
     if not varying:
         return _links(known, received, error)
@@ -225,10 +236,13 @@ def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) 
 @readable
 @dataclass(frozen=True)
 class Uplink:
-    """What a fusion's quantizers did to the estimates of `nodes`, by component.
+    """Traffic of a fusion's quantizers for the estimates of `nodes`, by component.
 
-    saturated, whether a component was out of reach, and symbols, how many were sent for it: (run, time, node, n) in a
-    record; in statistics their means over the runs, (time, node, n).
+    Args:
+        nodes: names of the nodes.
+        saturated: whether a component was beyond the amplitude, (run, time, node, n) in a record; in statistics the
+            mean over the runs, (time, node, n).
+        symbols: how many symbols were sent for it, in the same form.
     """
 
     nodes: tuple[str, ...]
@@ -236,9 +250,9 @@ class Uplink:
     symbols: np.ndarray
 
     def saturated_share(self) -> dict[str, float]:
-        """Share of the samples (runs, steps and components) that were out of reach, by node."""
+        """Share of the samples (runs, steps and components) that saturated, by node."""
         return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
 
     def symbols_per_value(self) -> float:
-        """Mean number of symbols that one component of one estimate took."""
+        """Mean number of symbols per component of an estimate."""
         return float(self.symbols.mean())

@@ -1,4 +1,4 @@
-"""From the axes of groups and kinds, as a network is computed, to the names of its nodes and filters."""
+"""Results by names of nodes and filters, from the axes of groups and kinds in which a network is computed."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,11 +13,11 @@ from heliograph.simulation.network import FUSED, Network
 def reports_by_name(
     network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, dict[str, SentReports]]:
-    """Reports by fusion and node, without the rows that a node has not, from (..., node, m) and (..., node)."""
+    """Reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
     result: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
         fusion = network.fused[name]
-        assert isinstance(fusion, Fusion)  # nothing else hears reports
+        assert isinstance(fusion, Fusion)  # no other rule uses reports
         nodes, n = network.nodes_with(fusion.filter), len(network.states)
         sizes = [link.received(n) for link in fusion.links(nodes)]
         result[name] = {
@@ -28,7 +28,7 @@ def reports_by_name(
 
 
 def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Measurements by node, in the given order, from those of the groups (..., node, received)."""
+    """Measurements by node, in the order of the network, from those of the groups (..., node, received)."""
     received = {
         name: np.asarray(z)[..., i, :]
         for names, z in zip(network.groups, groups, strict=True)
@@ -40,7 +40,7 @@ def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str,
 def by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
-    """What `read` gives of each kind's part, by node and filter: split at its axes (filter, node), the first `axis`.
+    """Results of `read` by node and filter: each kind's part split at its axes (filter, node), the first at `axis`.
 
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """

@@ -23,9 +23,10 @@ SENT = ("saturated", "symbols")
 
 
 def record_frame(record: "Record") -> "pd.DataFrame":
-    """A row for each time, or run and time; columns (node, filter, quantity, component, other)."""
+    """Table of a record: a row for each time, or run and time; columns (node, filter, quantity, component, other)."""
     import pandas as pd
 
+    # Columns: truth, measurements, estimates, uplinks.
     columns: dict[Column, np.ndarray] = {}
     if record.truth is not None:
         columns |= {("", "", "truth", s, ""): record.truth[..., i] for i, s in enumerate(record.states)}
@@ -39,6 +40,7 @@ def record_frame(record: "Record") -> "pd.DataFrame":
             for quantity in SENT:
                 values = getattr(uplink, quantity)
                 columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(record.states)}
+    # Rows: runs one after another.
     index = pd.Index(record.time, name="time")
     if record.runs is not None:
         index = pd.MultiIndex.from_product([range(record.runs), index], names=["run", "time"])
@@ -48,7 +50,7 @@ def record_frame(record: "Record") -> "pd.DataFrame":
 
 
 def record_of_frame(frame: "pd.DataFrame") -> "Record":
-    """The record in such a table.
+    """Record from such a table.
 
     Raises:
         ValueError: no such table.
@@ -58,6 +60,7 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
 
     if list(getattr(getattr(frame, "columns", None), "names", ())) != LEVELS:
         raise fail("table", f"columns {LEVELS}, as Record.to_pandas makes them", type(frame).__name__)
+    # Values by (node, filter, quantity), components along the last axis.
     runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
     steps = len(frame) // (runs or 1)
     lead = (steps,) if runs is None else (runs, steps)
@@ -66,6 +69,7 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
         values = frame.iloc[:, i].to_numpy().reshape(lead)
         parts.setdefault((node, name, quantity), {})[component, other] = values
     joined = {key: np.stack(list(part.values()), axis=-1) for key, part in parts.items()}
+    # Sort them into truth, measurements, estimates and uplinks.
     states: tuple[str, ...] = ()
     measurements: dict[str, np.ndarray] = {}
     estimates: dict[str, dict[str, Estimate]] = {}
@@ -91,9 +95,10 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
 
 
 def statistics_frame(result: "StatisticsByName") -> "pd.DataFrame":
-    """A row for each node and filter: claim, runs, RMSE and NEES with errors, then each state's RMSE and claim."""
+    """Table of statistics: a row for each node and filter, with claim, runs, RMSE, NEES, and figures by state."""
     import pandas as pd
 
+    # Failed runs stand in the row, without a warning each.
     rows, index = [], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row says in how many runs it failed
@@ -106,8 +111,10 @@ def statistics_frame(result: "StatisticsByName") -> "pd.DataFrame":
 
 
 def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+    # Figures of all states together, then of each state.
     nees, low, high = item.nees_per_dimension()
     rmse, error = item.rmse()
+    # Figures of each state, after those of all together.
     by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
     total = {
         "claim": "none" if item.failed_runs else item.claim,
@@ -125,7 +132,7 @@ def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, obj
 
 
 def _labels(columns: Sequence[Column]) -> Any:
-    """Labels as they are: none is taken for a number or for nothing."""
+    """Column labels as they are: none is converted to a number or to a missing value."""
     import pandas as pd
 
     levels = [list(dict.fromkeys(column[i] for column in columns)) for i in range(len(LEVELS))]

@@ -1,4 +1,4 @@
-"""Labelled arrays: what datasets of records and of statistics have in common."""
+"""Labelled arrays: the common parts of datasets of records and of statistics."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -42,7 +42,7 @@ MEANING = {
 
 
 def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
-    """Units by the state's name, and of `time`; those that say nothing are left out.
+    """Units by the state's name, and of `time`; empty ones are left out.
 
     Raises:
         ValueError: a name that is no state, a unit that is no text.
@@ -66,7 +66,7 @@ def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...]
 
 
 def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
-    """What each filter claims, at its place; empty elsewhere."""
+    """Claim of each filter, at its place; empty elsewhere."""
     result = np.full(sizes, "", dtype="U7")
     for place, item in outcome:
         claim: Claim = item.claim
@@ -77,14 +77,16 @@ def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], A
 def uplink_variables(
     uplinks: "Mapping[str, Uplink]", lead: list[str], n: int
 ) -> dict[str, tuple[list[str], np.ndarray]]:
-    """What quantizers did, by fusion and sender; each keeps its kind of number."""
+    """Variables of the quantizers, by fusion and sender, with integers and booleans as they are."""
     if not uplinks:
         return {}
+    # Places of the senders in each fusion, -1 for none.
     senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
     fusions, first = list(uplinks), next(iter(uplinks.values()))
     place = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
     parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *place.shape, n), getattr(first, name).dtype)
              for name in ("saturated", "symbols")}  # fmt: skip
+    # Values by fusion and sender.
     for i, uplink in enumerate(uplinks.values()):
         for j, node in enumerate(uplink.nodes):
             place[i, senders.index(node)] = j
@@ -96,7 +98,7 @@ def uplink_variables(
 
 
 def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
-    """The uplinks in a dataset, by the fusion's name."""
+    """Uplinks of a dataset, by the fusion's name."""
     from heliograph.simulation.centres.uplinks import Uplink
 
     if "place" not in dataset:
@@ -121,16 +123,19 @@ def dataset_of(
     units: Mapping[str, str],
     claims: str,
 ) -> "xr.Dataset":
-    """A dataset that says what it holds, with names, times and units for coordinates."""
+    """Dataset with a title, descriptions of its variables, and names, times and units as coordinates."""
     import xarray as xr
 
+    # Variables, with their meaning in words.
     data = {name: (axes, values, {"long_name": MEANING[name]} if name in MEANING else {})
             for name, (axes, values) in variables.items()}  # fmt: skip
+    # Coordinates: names, time, units.
     coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
     coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
     states = labels["state"]
     if any(state in units for state in states):
         coordinates["unit"] = (["state"], text([units.get(state, "") for state in states]))
+    # Attributes for people; the claims are a variable too.
     attributes = {
         "title": title,
         "heliograph": heliograph.__version__,
@@ -149,14 +154,14 @@ def claims_text(result: Any) -> str:
 
 
 def text(names: Sequence[str]) -> np.ndarray:
-    """Names as they are, whatever characters they have."""
+    """Names as an array of objects, whatever characters they have."""
     result = np.empty(len(names), dtype=object)
     result[:] = names
     return result
 
 
 def check_title(dataset: "xr.Dataset", title: str) -> None:
-    """Raise ValueError unless the dataset says that it holds this."""
+    """Raise ValueError unless the dataset has this title."""
     came = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
     if came != title:
         raise fail("dataset", f"one whose title is {title!r}", repr(came))
@@ -170,7 +175,7 @@ def names_of(dataset: "xr.Dataset", axis: str) -> list[str]:
 
 
 def values_of(dataset: "xr.Dataset", name: str, axes: Sequence[str]) -> np.ndarray:
-    """A variable with its dimensions in this order."""
+    """Values of a variable with its dimensions in this order."""
     if name not in dataset or set(dataset[name].dims) != set(axes):
         came = list(dataset[name].dims) if name in dataset else "no such variable"
         raise fail(f"dataset, variable {name!r}", f"the dimensions {list(axes)}", came)
@@ -178,7 +183,7 @@ def values_of(dataset: "xr.Dataset", name: str, axes: Sequence[str]) -> np.ndarr
 
 
 def units_of(dataset: "xr.Dataset") -> dict[str, str]:
-    """The units that were given."""
+    """Units of the states and of time in a dataset."""
     time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
     if "unit" not in dataset.coords:
         return time

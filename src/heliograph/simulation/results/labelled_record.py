@@ -1,4 +1,4 @@
-"""A record as labelled arrays, and back: nothing is lost."""
+"""Conversion of a record to labelled arrays, and back without loss."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, cast
@@ -29,14 +29,15 @@ RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
 def record_dataset(record: "Record") -> "xr.Dataset":
-    """A record with dimensions run (of Monte Carlo runs), time, node, filter, state and other (also a state).
+    """Dataset of a record with dimensions run (of Monte Carlo runs), time, node, filter, state and other.
 
-    A filter that a node does not have is NaN, and its `claim` is empty.
+    `other` is a state too. A filter that a node does not have is NaN, and its `claim` is empty.
     """
     nodes = list(dict.fromkeys([*record.measurements, *record.estimates]))
     filters = list(dict.fromkeys(name for estimate in record.estimates.values() for name in estimate))
     lead, axes = _lead(record), [] if record.runs is None else ["run"]
     n, sizes = len(record.states), (len(nodes), len(filters))
+    # Estimates and measurements with their places.
     results = [
         ((nodes.index(node), filters.index(name)), estimate)
         for node, estimate_ in record.estimates.items()
@@ -44,6 +45,7 @@ def record_dataset(record: "Record") -> "xr.Dataset":
     ]
     received = [((nodes.index(node),), z) for node, z in record.measurements.items()]
     most = max((z.shape[-1] for _, z in received), default=0)
+    # Variables, NaN where a node has no such filter or component.
     variables = {
         "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), received)),
         "length": (["node"], _per_node(nodes, {node: z.shape[-1] for node, z in record.measurements.items()})),
@@ -66,7 +68,7 @@ def record_dataset(record: "Record") -> "xr.Dataset":
 
 
 def record_from(dataset: "xr.Dataset") -> "Record":
-    """The record that `record_dataset` was given.
+    """Record from a dataset that `record_dataset` made.
 
     Raises:
         ValueError: no such dataset.
@@ -76,11 +78,13 @@ def record_from(dataset: "xr.Dataset") -> "Record":
     check_title(dataset, RECORD)
     lead = ["run", TIME] if "run" in dataset.dims else [TIME]
     nodes, filters = names_of(dataset, "node"), names_of(dataset, "filter")
+    # Variables with their axes in order.
     measurement = values_of(dataset, "measurement", [*lead, "node", "received"])
     mean = values_of(dataset, "mean", [*lead, "node", "filter", "state"])
     covariance = values_of(dataset, "covariance", [*lead, "node", "filter", "state", "other"])
     claim = values_of(dataset, "claim", ["node", "filter"])
     length, estimated = values_of(dataset, "length", ["node"]), values_of(dataset, "estimated", ["node"])
+    # Back to nodes and filters by name.
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node, item in zip(nodes, estimated, strict=True) if item}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         value = Estimate(mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy(), cast(Claim, str(claim[i, j])))

@@ -1,4 +1,4 @@
-"""Statistics as labelled arrays, and back: figures for people beside the sums that they are made from."""
+"""Conversion of statistics to labelled arrays, and back: figures for people, and the sums that they come from."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -31,7 +31,8 @@ STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
 
 
 def statistics_dataset(result: "StatisticsByName") -> "xr.Dataset":
-    """Statistics with dimensions time, node, filter, state and other, and the sums by batch that they are made from."""
+    """Dataset of statistics with dimensions time, node, filter, state and other, and the sums by batch."""
+    # Statistics with their places.
     nodes = list(result)
     filters = list(dict.fromkeys(name for item in result.values() for name in item))
     every = [
@@ -45,9 +46,10 @@ def statistics_dataset(result: "StatisticsByName") -> "xr.Dataset":
     batch, steps = (len(first.count), first.nees.shape[1]), first.nees.shape[1]
 
     def of(name: str) -> np.ndarray:
-        """Sums of pairs i <= j as symmetric matrices."""
+        """Return sums of pairs i <= j as symmetric matrices."""
         return filled(batch, sizes, (n, n), [(place, matrices(getattr(item, name))) for place, item in every])
 
+    # Figures over time: squared errors, claimed variances, NEES, failures.
     squares = [(place, np.diagonal(item.actual(), axis1=-2, axis2=-1)) for place, item in every]
     claimed = [(place, np.diagonal(item.claimed(), axis1=-2, axis2=-1)) for place, item in every]
     distances = [(place, item.nees.sum(axis=0) / item.runs / n) for place, item in every]
@@ -55,6 +57,7 @@ def statistics_dataset(result: "StatisticsByName") -> "xr.Dataset":
     failed = [(place, np.array(item.failed_runs)) for place, item in every]
     filters_of = ["node", "filter"]
     uplinks = {name: item.uplink for name, item in result.get(FUSED, {}).items() if item.uplink}
+    # Sums by batch, from which the statistics can be restored, then figures.
     variables = {
         "runs": (["batch"], first.count),
         "errors": (["batch", TIME, *filters_of, "state", "other"], of("pairs")),
@@ -74,7 +77,7 @@ def statistics_dataset(result: "StatisticsByName") -> "xr.Dataset":
 
 
 def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
-    """The statistics that `statistics_dataset` was given.
+    """Statistics from a dataset that `statistics_dataset` made.
 
     Raises:
         ValueError: no such dataset.
@@ -84,6 +87,7 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
     check_title(dataset, STATISTICS)
     nodes, filters, states = (names_of(dataset, axis) for axis in ("node", "filter", "state"))
     batch, of = ["batch", TIME, "node", "filter"], ["node", "filter"]
+    # Sums by batch; of symmetric matrices the pairs i <= j.
     upper = np.triu_indices(len(states))
     errors, claimed = (
         values_of(dataset, name, [*batch, "state", "other"])[..., *upper] for name in ("errors", "claimed")
@@ -93,6 +97,7 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
     )
     failed_runs, count = values_of(dataset, "failed_runs", of), values_of(dataset, "runs", ["batch"])
     uplinks = uplinks_from(dataset, [TIME])
+    # Back to nodes and filters by name.
     results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in nodes}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         by_step = None if np.isnan(failed[:, i, j]).any() else failed[:, i, j].copy()

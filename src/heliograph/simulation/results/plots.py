@@ -1,4 +1,4 @@
-"""Results on axes of matplotlib, the user's or new ones: one for each state."""
+"""Plots of results on axes of matplotlib, given or new: one for each state."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -24,13 +24,15 @@ def plot_record(
     run: int,
     sigmas: float,
 ) -> "list[Axes]":
-    """Draw estimates within their claimed bands, and the truth."""
+    """Draw estimates with their claimed bands, and the truth."""
+    # What is drawn, on which axes.
     node, filters = _chosen(record.estimates, node, filters)
     places = _places(states, record.states)
     if record.runs is not None and check_count("run", run, 0) >= record.runs:
         raise fail("run", f"one of {record.runs}, counted from 0", run)
     which: Any = ... if record.runs is None else run
     drawn = _axes(axes, len(places), record.time, record.units)
+    # Mean and +- sigmas claimed deviations, then the truth.
     for item, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
             estimate, colour = record.estimates[node][name], _colour(number)
@@ -55,6 +57,7 @@ def plot_statistics(
     axes: "Axes | Sequence[Axes] | None",
 ) -> "list[Axes]":
     """Draw RMSE over time, and dashed the root of the mean claimed variance."""
+    # What is drawn, on which axes.
     node, filters = _chosen(result, node, filters)
     places = _places(states, result.states)
     time = np.arange(1.0, result[node][filters[0]].nees.shape[1] + 1)
@@ -73,7 +76,7 @@ def plot_statistics(
 def _chosen(
     known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
-    """The node and its filters that are drawn: the first with any, and all."""
+    """Choose the node and its filters to draw: the first with any, and all."""
     there = [name for name, mine in known.items() if mine]
     if not there or node not in (None, *there):
         raise fail("node", f"one with filters: {', '.join(there) or 'there is none'}", repr(node))
@@ -96,7 +99,7 @@ def _places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
 
 
 def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
-    """The given axes, or those of a new figure, one below the other."""
+    """Return the given axes, or those of a new figure, one below the other."""
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -112,7 +115,7 @@ def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) 
 
 
 def _colour(number: int) -> str:
-    """The next of the user's colours, as they are now."""
+    """Next of the user's colours."""
     from matplotlib.colors import to_hex
 
     return to_hex(f"C{number % 10}")

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectories of the truth, of what was measured, and of estimates with their claims."""
+"""Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,11 +28,16 @@ if TYPE_CHECKING:  # extras
 class Record(Saved):
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
-    truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
-    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
-    reports[name][node] of each fusion that hears reports.
-    time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
-    smoothed: the same of estimates given later data too, where these were asked for: a record of its own to save.
+    Args:
+        time: numbers (time,), or dates (datetime64, UTC).
+        states: names of the plant's states.
+        truth: true states (run, time, n); None in a recording.
+        measurements: by node, (run, time, received), NaN where nothing arrived.
+        estimates: by node and filter, with mean (run, time, n), covariance (run, time, n, n) and the claim.
+        uplinks: by name, of each fusion that has quantizers.
+        units: by the state's name, and of "time"; empty where they were not given.
+        smoothed: record of estimates given later data too; None where these were not asked for. It is saved separately.
+        reports: by fusion and node, of each fusion that uses reports.
     """
 
     time: np.ndarray
@@ -47,13 +52,13 @@ class Record(Saved):
 
     @property
     def runs(self) -> int | None:
-        """Number of Monte Carlo runs; None of one recording."""
+        """Number of Monte Carlo runs; None for one recording."""
         means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
         every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
         return len(every[0]) if every and every[0].ndim == 3 else None
 
     def with_units(self, units: Mapping[str, str]) -> "Record":
-        """The same record with units, by the state's name and of "time", for files, tables and figures.
+        """Return the record with units, by the state's name and of "time", for files, tables and figures.
 
         Raises:
             ValueError: a name that is no state.
@@ -89,7 +94,7 @@ class Record(Saved):
         return dict(zip(self.states, np.sqrt(squares.mean(axis=0)).tolist(), strict=True))
 
     def to_xarray(self) -> "xr.Dataset":
-        """Labelled arrays: dimensions run, time, node, filter, state; `Record.from_xarray` has the record again.
+        """Labelled arrays: dimensions run, time, node, filter, state; `Record.from_xarray` converts them back.
 
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
@@ -98,7 +103,7 @@ class Record(Saved):
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
-        """The record in a dataset that `to_xarray` made, or in a part of one that keeps its dimensions.
+        """Record from a dataset that `to_xarray` made, or from a part of one that keeps its dimensions.
 
         Raises:
             ValueError: no such dataset.
@@ -106,7 +111,7 @@ class Record(Saved):
         return record_from(dataset)
 
     def to_pandas(self) -> "pd.DataFrame":
-        """A table: a row for each time (and run), columns (node, filter, quantity, component, other).
+        """Table: a row for each time (and run), columns (node, filter, quantity, component, other).
 
         Quantities: truth, measurement, mean, "covariance (CLAIM)" of component and other, saturated, symbols.
 
@@ -117,7 +122,7 @@ class Record(Saved):
 
     @classmethod
     def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
-        """The record in a table that `to_pandas` made; units are not in it.
+        """Record from a table that `to_pandas` made; units are not in it.
 
         Raises:
             ValueError: no such table.
@@ -125,7 +130,7 @@ class Record(Saved):
         return record_of_frame(frame)
 
     def apart(self) -> list[str]:
-        """What is saved apart."""
+        """Names of the parts that are saved separately."""
         there = {"smoothed": self.smoothed is not None, "reports": bool(self.reports)}
         return [name for name, is_there in there.items() if is_there]
 
@@ -140,8 +145,13 @@ class Record(Saved):
     ) -> "list[Axes]":
         """Draw estimates with bands of +-`sigmas` claimed deviations, and the truth where known: one axes a state.
 
-        `axes` to draw on, as many as states; new ones unless given. Of the first node, all its filters and all states
-        unless told; `run` of Monte Carlo runs.
+        Args:
+            node: name of the node; the first by default.
+            filters: names of its filters; all by default.
+            states: names of states; all by default.
+            axes: to draw on, as many as states; new ones by default.
+            run: number of the Monte Carlo run; 0 by default.
+            sigmas: half-width of the bands in claimed deviations; 2 by default.
 
         Raises:
             ValueError: a node, filter, state or run that there is not, another number of axes.
@@ -150,14 +160,16 @@ class Record(Saved):
         return plot_record(self, node, filters, states, axes, run, sigmas)
 
     def failures(self) -> list[str]:
-        """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
+        """List filters whose estimate became non-finite or whose bound lost positive semidefiniteness, a line each.
 
         The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
         for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
         """
+        # Smoothed estimates first.
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
+                # First step and number of runs without a valid estimate.
                 bad = ~is_sound(estimate)
                 if np.any(bad):
                     by_time = bad.reshape(-1, bad.shape[-1])
@@ -165,6 +177,7 @@ class Record(Saved):
                     runs = int(by_time.any(axis=1).sum())
                     what = "mean" if estimate.claim == "none" else "covariance"
                     lines.append(f"{node}/{name}: no valid {what} from step {step} in {runs} of {len(by_time)} runs")
+        # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
                 saturated = uplink.saturated[..., i, :]

@@ -1,4 +1,4 @@
-"""What is kept of simulated runs: reduced block by block inside the compiled scan."""
+"""Reducers of simulated runs: sums and collected results, block by block inside the compiled scan."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,9 +22,14 @@ Result = TypeVar("Result")
 
 @readable
 class OfStep(NamedTuple):
-    """What is kept of one step of one run: what is summed over runs, in which runs it was ever so, what is collected.
+    """Results of one step of one run.
 
-    Numbers, truths, anything; each step's results are stacked, and of `ever` there is one for all steps.
+    Each step's results are stacked, but `ever` is one for all steps.
+
+    Args:
+        sums: numbers that are summed over runs.
+        ever: flags that count in how many runs they were true at some step.
+        collected: anything, collected for each run.
     """
 
     sums: PyTree = ()
@@ -34,30 +39,31 @@ class OfStep(NamedTuple):
 
 @readable
 class AbstractReducer(Module, Generic[Result]):
-    """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
+    """Reduction of simulated runs: a carry that is summed over blocks, and a part that is collected.
 
     A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes,
     "estimates": of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name,
-    "uplinks"}, as `Network` has groups and kinds. What all runs share, a covariance say, has length 1 along the runs.
+    "uplinks"}, as `Network` has groups and kinds. What all runs share, such as a covariance, has length 1 along the
+    runs.
     """
 
     def initial(self, shapes: PyTree) -> PyTree:
-        """The carry before the first block; `shapes` are those of a block."""
+        """Return the carry before the first block; `shapes` are those of a block."""
         raise NotImplementedError
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Next carry and collected part of a block, inside the compiled scan; runs that are not valid are padding."""
+        """Reduce a block inside the compiled scan: next carry and collected part; invalid runs are padding."""
         raise NotImplementedError
 
     def of_step(self, step: PyTree) -> OfStep:
-        """What is kept of one step of one run, for native code, which has no blocks.
+        """Reduce one step of one run, for native code, which has no blocks.
 
-        `step` is as a block without its axes of runs and time. A reducer that has none is computed by XLA.
+        `step` is as a block without its axes of runs and time. A reducer without this method is computed by XLA.
         """
         raise NotImplementedError
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
-        """The carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
+        """Return the carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
 
         `common` says of each part whether it is the same in all runs: it stands in the sums as of one run, (time, ...).
         """
@@ -68,23 +74,23 @@ class AbstractReducer(Module, Generic[Result]):
         raise NotImplementedError
 
     def joined(self, results: Sequence[Result], network: Network) -> Result:
-        """The result of a network from those of its parts, each of some of its nodes with the same plant and runs."""
+        """Join the results of parts of a network, each of some of its nodes with the same plant and runs."""
         raise NotImplementedError
 
     def others(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
-        """The result with the one made of smoothed estimates, whose claims these are, beside it.
+        """Return the result with that of smoothed estimates, whose claims these are, as its `smoothed`.
 
         Raises:
-            ValueError: a reducer that keeps nothing of smoothed estimates.
+            ValueError: a reducer without results for smoothed estimates.
         """
         raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
 
 
 class Trajectories(AbstractReducer[Record]):
-    """Keep everything; memory grows with the number of runs."""
+    """Collect all trajectories; memory grows with the number of runs."""
 
     def initial(self, shapes: PyTree) -> PyTree:
-        """Nothing is summed."""
+        """Empty carry: nothing is summed."""
         return ()
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
@@ -92,7 +98,7 @@ class Trajectories(AbstractReducer[Record]):
         return carry, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), batch)
 
     def of_step(self, step: PyTree) -> OfStep:
-        """All of it."""
+        """Collect the whole step."""
         return OfStep(collected=step)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Record:
@@ -101,7 +107,7 @@ class Trajectories(AbstractReducer[Record]):
         return trajectories_record(network, collected, time)
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
-        """All nodes, in the network's order."""
+        """Join the nodes of all parts, in the network's order."""
         measurements = {name: z for result in results for name, z in result.measurements.items()}
         estimates = {name: filters for result in results for name, filters in result.estimates.items()}
         return replace(
@@ -111,7 +117,7 @@ class Trajectories(AbstractReducer[Record]):
         )
 
     def others(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
-        """As `Record.smoothed`, for the last steps if there are fewer."""
+        """Return the record with `smoothed`, whose time is that of the last steps if there are fewer."""
         estimates = {
             node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
             for node, filters in smoothed.estimates.items()

@@ -1,4 +1,4 @@
-"""Datasets in files: NetCDF or Zarr, whole or not at all, every name as it was."""
+"""Datasets in files: NetCDF or Zarr, written whole or not at all, with names unchanged."""
 
 import warnings
 from collections.abc import Callable
@@ -22,25 +22,25 @@ MARK = "zarr.json"  # what a Zarr folder has, and nothing else
 
 
 class Saved:
-    """What a dataset holds, and so a file: `to_xarray` and `from_xarray` are its own, `save` and `open` follow."""
+    """Results that convert to and from a dataset, and so to and from a file with `save` and `open`."""
 
     def to_xarray(self) -> "xr.Dataset":
-        """It as labelled arrays."""
+        """Convert to labelled arrays."""
         raise NotImplementedError
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> Self:
-        """It again."""
+        """Convert back from labelled arrays."""
         raise NotImplementedError
 
     def apart(self) -> list[str]:
-        """What is no part of the dataset, being results of their own."""
+        """Names of the parts that are not in the dataset, being results of their own."""
         return []
 
     def save(self, path: str | Path) -> None:
-        """Write it to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` has it again.
+        """Write to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` reads it.
 
-        Warns of what has to be saved apart, such as `smoothed`.
+        Warns of parts that have to be saved separately, such as `smoothed`.
 
         Raises:
             ValueError: another ending, or a place that cannot be written.
@@ -52,7 +52,7 @@ class Saved:
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             ValueError: no such file, or another one.
@@ -62,7 +62,7 @@ class Saved:
 
 
 def save(dataset: "xr.Dataset", path: str | Path) -> None:
-    """Write a dataset to a NetCDF file or a Zarr folder, in the place of an earlier one.
+    """Write a dataset to a NetCDF file or a Zarr folder, replacing an earlier one.
 
     Raises:
         ValueError: another ending, a place that cannot be written or that holds something else.
@@ -71,10 +71,12 @@ def save(dataset: "xr.Dataset", path: str | Path) -> None:
     path = file_path("file of results", path)
     kind = _kind(path)
     import_module(kind)
+    # Names as text that any file can hold; floats without a fill value.
     plain = dataset.assign_coords({name: (c.dims, _mapped(in_file, c), c.attrs) for name, c in _texts(dataset)})
     encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
     if dataset["time"].dtype.kind == "M":
         encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
+    # A folder, or a file, that replaces an earlier one when it is complete.
     if kind == "zarr":
         check_replaceable(path, MARK)
         with whole_folder(path) as folder, warnings.catch_warnings():
@@ -109,7 +111,7 @@ def opened(path: str | Path) -> "xr.Dataset":
 
 
 def _kind(path: Path) -> str:
-    """The package that writes the format."""
+    """Name of the package that writes the format."""
     kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
     if path.suffix.lower() not in kinds:
         raise fail(str(path), f"a name that ends in {' or '.join(kinds)}", repr(path.suffix))
@@ -117,7 +119,7 @@ def _kind(path: Path) -> str:
 
 
 def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
-    """The coordinates that are names."""
+    """Coordinates that are names."""
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 
 

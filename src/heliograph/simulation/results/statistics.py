@@ -1,4 +1,4 @@
-"""Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
+"""Claimed against actual error: RMSE, NEES and the worst direction of the covariance, each with its standard error."""
 
 import math
 import warnings
@@ -19,12 +19,20 @@ BATCHES = 50  # runs are dealt to this many batches; the spread between batch me
 @readable
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
+    """Error statistics of one filter of one node: sums over the runs of each batch, from which every figure follows.
 
-    count (batch,), pairs = sum e_i e_j and claimed_pairs = mean claimed covariance (batch, time, pair i <= j, row by
-    row), nees = sum e' B^-1 e (batch, time), claim as the filter states it; uplink of a fusion that has quantizers.
-    Where no covariance is claimed, what is made of covariances is NaN. failed (time,): in how many runs there was no
-    valid estimate at each step, failed_runs: at some step; then figures are NaN, and say so.
+    Where no covariance is claimed, figures of covariances are NaN.
+
+    Args:
+        count: number of runs (batch,).
+        pairs: sums of e_i e_j (batch, time, pair i <= j, row by row).
+        claimed_pairs: mean claimed covariance, in the form of `pairs`.
+        nees: sums of e' B^-1 e (batch, time).
+        claim: what the filter claims of its covariance.
+        uplink: of a fusion that has quantizers; None by default.
+        failed: number of runs without a valid estimate at each step (time,); None by default.
+        failed_runs: number of runs without a valid estimate at some step, 0 by default; if there are any, figures are
+            NaN, with a warning.
     """
 
     count: np.ndarray
@@ -38,7 +46,7 @@ class ErrorStatistics:
 
     @property
     def failure(self) -> str:
-        """What is wrong with the estimates, in the words of a record's failures; empty if nothing is."""
+        """Failure of the estimates in the words of a record's failures; empty without."""
         if not self.failed_runs:
             return ""
         what = "mean" if self.claim == "none" else "covariance"
@@ -111,7 +119,7 @@ class ErrorStatistics:
     def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
         """Mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
 
-        The interval is from the batch means, so correlation over time within a run does no harm.
+        The interval is from the batch means, so correlation over time within a run does not matter.
         """
         self._tell()
         n = self.outer.shape[-1]
@@ -120,7 +128,7 @@ class ErrorStatistics:
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":
-        """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, judged on runs that did not choose d.
+        """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, evaluated on runs that did not choose d.
 
         The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
         ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
@@ -142,10 +150,12 @@ class ErrorStatistics:
     def _ratio_on(self, held_out: np.ndarray) -> "WorstDirection":
         chosen = ~held_out & (self.count > 0)
         actual, claimed = self.outer[chosen].sum(axis=0), self.covariance[chosen].sum(axis=0)
+        # Step and direction of the largest ratio in the other half of the batches.
         values, directions = _generalised_eigen(actual, claimed)
         step = int(np.argmax(values[:, -1]))
         d = directions[step, :, -1]
         judged = held_out & (self.count > 0)
+        # Ratio in this half.
         error = np.einsum("i,bij,j->b", d, self.outer[judged, step], d)
         bound = np.einsum("i,bij,j->b", d, self.covariance[judged, step], d)
         ratio = float(error.sum() / bound.sum())
@@ -166,9 +176,10 @@ def matrices(pairs: np.ndarray) -> np.ndarray:
 
 
 def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
-    """Statistics of several nodes together, their steps joined: means run over nodes as over steps.
+    """Pool the statistics of several nodes, their steps joined: means run over nodes as over steps.
 
-    Runs stay the unit of independence, so errors that nodes share are counted as shared.
+    Runs stay the unit of independence, so errors that nodes share are counted as shared. `statistics` are those of the
+    nodes, of the same runs.
 
     Raises:
         ValueError: nothing to pool, or statistics of different runs.
@@ -176,6 +187,7 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     parts = items("pooled statistics", statistics, "ErrorStatistics")
     for part in parts:
         instance("pooled statistics", part, ErrorStatistics, "ErrorStatistics")
+    # Steps one after another; the weakest claim.
     if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
     return ErrorStatistics(
@@ -192,7 +204,14 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
 @readable
 @dataclass(frozen=True)
 class WorstDirection:
-    """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""
+    """Direction in which the actual covariance exceeds the claimed one most.
+
+    Args:
+        ratio: of the actual variance in this direction to the claimed one.
+        standard_error: of the ratio.
+        step: at which the ratio is largest, from 0.
+        direction: unit vector (n,).
+    """
 
     ratio: float
     standard_error: float
@@ -218,7 +237,7 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Root of that mean, and its standard error."""
+    """Root of the mean of per-run values, and its standard error."""
     mean, error = _batch_mean(sums, count)
     root = float(np.sqrt(mean))
     return root, error / (2 * root) if root else 0.0
@@ -227,7 +246,7 @@ def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
 
-    In units of each component's own B_ii, and where that is zero of its A_ii.
+    Each component is in units of its B_ii, and where that is zero of its A_ii.
     """
     local = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
     unit = np.where(local[0] > 0, local[0], np.where(local[1] > 0, local[1], 1.0))

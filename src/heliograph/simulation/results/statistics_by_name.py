@@ -1,4 +1,4 @@
-"""Statistics of errors by node and filter."""
+"""Error statistics by node and filter."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -19,9 +19,15 @@ if TYPE_CHECKING:  # extras
 
 @readable
 class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
-    """Statistics by node and filter; fused ones under "fused". They know the states' names, and units if given.
+    """Error statistics by node and filter; fused ones under "fused".
 
-    smoothed: of estimates given later data too, where these were asked for: statistics of their own to save.
+    `smoothed` holds statistics of estimates given later data too, None where these were not asked for. They are saved
+    separately.
+
+    Args:
+        result: statistics by node and filter.
+        states: names of the plant's states.
+        units: by the state's name; none by default.
     """
 
     def __init__(
@@ -35,7 +41,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         self.smoothed: StatisticsByName | None = None
 
     def with_units(self, units: Mapping[str, str]) -> "StatisticsByName":
-        """The same statistics with units, by the state's name, for files, tables and figures.
+        """Return the statistics with units, by the state's name, for files, tables and figures.
 
         Raises:
             ValueError: a name that is no state.
@@ -54,7 +60,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
-        """The statistics in a dataset that `to_xarray` made.
+        """Statistics from a dataset that `to_xarray` made.
 
         Raises:
             ValueError: no such dataset.
@@ -62,7 +68,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return statistics_from(dataset)
 
     def to_pandas(self) -> "pd.DataFrame":
-        """A row for each node and filter: claim, runs, RMSE and NEES with their errors, each state's RMSE and claim.
+        """Table: a row for each node and filter, with claim, runs, RMSE, NEES, their errors, and figures by state.
 
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
@@ -70,7 +76,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return statistics_frame(self)
 
     def apart(self) -> list[str]:
-        """What is saved apart."""
+        """Names of the parts that are saved separately."""
         return [] if self.smoothed is None else ["smoothed"]
 
     def plot(
@@ -80,10 +86,13 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         states: Sequence[str] | None = None,
         axes: "Axes | Sequence[Axes] | None" = None,
     ) -> "list[Axes]":
-        """Draw the RMSE over time, and dashed what the filter claims: one axes a state.
+        """Draw the RMSE over time, and dashed the claimed deviation: one axes a state.
 
-        `axes` to draw on, as many as states; new ones unless given. Of the first node, all its filters and all states
-        unless told.
+        Args:
+            node: name of the node; the first by default.
+            filters: names of its filters; all by default.
+            states: names of states; all by default.
+            axes: to draw on, as many as states; new ones by default.
 
         Raises:
             ValueError: a node, filter or state that there is not, another number of axes.
@@ -92,7 +101,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return plot_statistics(self, node, filters, states, axes)
 
     def failures(self) -> list[str]:
-        """One line for each filter whose estimate was no number, or its covariance none, in some run, as of a record.
+        """List filters without a valid estimate in some run, a line each, as for a record.
 
         One line more for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
         """

@@ -1,4 +1,4 @@
-"""The sums from which statistics of errors are made, run by run in bounded memory, or from kept trajectories."""
+"""Sums for error statistics, run by run in bounded memory, or from stored trajectories."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -33,10 +33,12 @@ class Sums(Module):
     """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
 
     Run r goes to batch r mod BATCHES. A covariance that all runs share is summed once, without batches.
+
     failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
-    `order`: whose estimates the parts are, kinds first and then fused ones; the first `local` have their own
-    covariances.
+
+    `order`: whose estimates the parts are, kinds first and then fused ones; the first `local` have covariances that
+    differ between runs.
     """
 
     count: jax.Array
@@ -52,12 +54,13 @@ class Sums(Module):
 
 
 class Statistics(AbstractReducer[StatisticsByName]):
-    """Keep running error statistics of every filter of every node; memory does not grow with the number of runs."""
+    """Reduce to error statistics of every filter of every node; memory does not grow with the number of runs."""
 
     def initial(self, shapes: PyTree) -> Sums:
-        """Zero sums."""
+        """Return sums of zero."""
         _, steps, n = shapes["truth"].shape
         parts, order, local = _parts(shapes)
+        # Parts with covariances by run first, then those with a common one.
         sizes = [int(np.prod(parts[i].mean.shape[2:-1])) for i in order]
         total, mine, pairs = sum(sizes), sum(sizes[:local]), n * (n + 1) // 2
         return Sums(
@@ -74,10 +77,12 @@ class Statistics(AbstractReducer[StatisticsByName]):
         )
 
     def reduce(self, carry: Sums, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[Sums, PyTree]:
-        """Add the valid runs, dealt to batches: a few steps after another, so that what is made of them stays near."""
+        """Add the valid runs, dealt to batches: a few steps at a time, so that they stay in the cache."""
+        # The axis of runs last.
         parts, order, _ = _parts(batch)
         rows = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (batch["truth"], [parts[i] for i in order]))
         steps, n = rows[0].shape[:2]
+        # Steps in pieces that fit the cache.
         width = _steps_at_once(steps, n * carry.pairs.shape[1] * len(runs) * carry.pairs.itemsize)
         dealt = jax.tree.map(lambda leaf: leaf.reshape(steps // width, width, *leaf.shape[1:]), rows)
 
@@ -85,12 +90,14 @@ class Statistics(AbstractReducer[StatisticsByName]):
             following, bad = _added(state[0], row[0], row[1], runs[0] % BATCHES, valid)
             return (following, state[1] | jnp.any(bad, axis=0)), None
 
+        # Sums over the pieces, and where some step had no estimate.
         begin = carry, jnp.zeros((2, carry.pairs.shape[1], len(runs)), dtype=bool)
         firsts = jnp.arange(0, steps, width)
         if width == steps:
             (sums, ever), _ = some(begin, jax.tree.map(lambda leaf: leaf[0], (firsts, dealt)))
         else:
             (sums, ever), _ = jax.lax.scan(some, begin, (firsts, dealt))
+        # Numbers of runs, and the quantizers' sums.
         counted = valid.astype(float)
         sent = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(valid), *x.shape[1:])), batch["uplinks"])
         return replace(
@@ -101,17 +108,20 @@ class Statistics(AbstractReducer[StatisticsByName]):
         ), ()
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Products of errors, e' B^-1 e, claimed covariances, and where there is no estimate."""
+        """Products of errors, e' B^-1 e, claimed covariances, and flags of invalid estimates."""
         truth = jnp.asarray(step["truth"])
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)
+        # The axis of parts last.
         means = [jnp.asarray(part.mean).reshape(-1, n).T for part in parts]
         claimed = [jnp.moveaxis(jnp.asarray(part.covariance).reshape(-1, n, n), 0, -1) for part in parts]
+        # Errors and their NEES, and where these are invalid.
         errors = [truth[:, None] - mean for mean in means]
         nees = [squared_distance(b, e, truth[:, None]) for b, e in zip(claimed, errors, strict=True)]
         joined, distance = jnp.concatenate(errors, axis=1), jnp.concatenate(nees)
         finite = jnp.all(jnp.isfinite(joined), axis=0)
         bad = jnp.stack([~finite, jnp.isnan(distance)])
+        # Pairs i <= j of symmetric matrices.
         rows, columns = np.triu_indices(n)
         sums = {
             "pairs": jnp.stack([joined[i] * joined[j] for i, j in zip(rows, columns, strict=True)], axis=-1),
@@ -125,18 +135,21 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return OfStep(sums, bad)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
-        """The same sums, with the covariances that all runs share last."""
+        """Return the carry after all runs, with the covariances that all runs share last."""
+        # Values that all runs share count once per run.
         shared = common.sums["claimed"]
         result, ever = jax.tree.map(
             lambda leaf, same: leaf[..., None] * count if same else leaf,
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
         )
+        # Order of the parts: covariances by run first.
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(shared)), key=shared.__getitem__))
         sizes = [part.shape[1] for part in claimed]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         into = np.concatenate([places[i] for i in order])
+        # Claimed covariances of both kinds.
         steps, _, pairs, _ = result["pairs"].shape
         items: Any = count
         mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
@@ -157,12 +170,14 @@ class Statistics(AbstractReducer[StatisticsByName]):
         )
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
-        """Statistics by node and filter."""
+        """Make the statistics by node and filter."""
+        # Sums by kind and fusion, then by name.
         count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
         kinds = len(network.kinds)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
         axes = enumerate((-3, -2, -3, -2, -2))
         items = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
+        # Statistics with their claims, then those of the quantizers.
         result = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             result[node] = {
@@ -175,14 +190,14 @@ class Statistics(AbstractReducer[StatisticsByName]):
         return result
 
     def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
-        """All nodes, in the network's order."""
+        """Join the nodes of all parts, in the network's order."""
         collected = {name: filters for result in results for name, filters in result.items()}
         return StatisticsByName({name: collected[name] for name in network.names}, network.states)
 
     def others(
         self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
-        """As `StatisticsByName.smoothed`."""
+        """Return the statistics with `smoothed`."""
         results = {
             node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
             for node, filters in smoothed.items()
@@ -199,7 +214,7 @@ def _statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> 
 
 
 def _parts(batch: PyTree) -> tuple[list[Estimate], tuple[int, ...], int]:
-    """The estimates of a block; their order, those with a covariance for each run first; and the number of these."""
+    """Estimates of a block; their order, those with a covariance for each run first; and the number of these."""
     parts = [*batch["estimates"], *(batch["fused"][name] for name in sorted(batch["fused"]))]
     shared = [part.covariance.shape[0] < batch["truth"].shape[0] for part in parts]
     return parts, tuple(sorted(range(len(parts)), key=shared.__getitem__)), shared.count(False)
@@ -208,17 +223,21 @@ def _parts(batch: PyTree) -> tuple[list[Estimate], tuple[int, ...], int]:
 def _added(
     sums: Sums, first: jax.Array, rows: tuple[jax.Array, list[Estimate]], start: jax.Array, valid: jax.Array
 ) -> tuple[Sums, jax.Array]:
-    """The sums with some steps from `first` on, of runs from batch `start` on; and where there is no estimate."""
+    """Add some steps from `first` on, of runs from batch `start` on; also return where there is no estimate."""
     truth, parts = rows
+    # Errors (n, time, part, run), zero for padding.
     errors = jnp.concatenate([_error(truth, part) for part in parts], axis=2)  # (n, time, part, run)
     errors = jnp.where(valid, errors, 0.0)  # the others may hold anything
+    # Claimed covariances: by run, and common to all.
     unit = jnp.eye(len(errors)).reshape(len(errors), len(errors), 1, 1, 1)
     mine = [jnp.where(valid, _claimed(part), unit) for part in parts[: sums.local]]
     bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(part) for part in parts[sums.local :]]) if b]
     split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
     size = truth.transpose(1, 0, 2)[:, :, None]
+    # e' B^-1 e, and where it is invalid.
     nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
     bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)], axis=1) & valid  # (time, 2, part, run)
+    # Sums by batch.
     claimed, shared = sums.claimed, sums.shared
     if sums.local:
         claimed = _added_from(claimed, _by_batch(jnp.where(valid, _pairs(bounds[0]), 0.0), start), first)
@@ -236,19 +255,19 @@ def _added(
 
 
 def _steps_at_once(steps: int, size: int) -> int:
-    """As many steps as divide them all and fill no more than the cache, each of this many bytes."""
+    """Largest divisor of `steps` whose steps, each of this many bytes, fit the cache."""
     return max(width for width in range(1, steps + 1) if steps % width == 0 and (width == 1 or width * size <= CACHE))
 
 
 def _error(truth: jax.Array, part: Estimate) -> jax.Array:
-    """x - xhat as (n, time, part, run), of what has the runs last."""
+    """x - xhat as (n, time, part, run), from arrays with runs last."""
     mean = jnp.asarray(part.mean)
     mean = mean.reshape(len(mean), -1, *mean.shape[-2:])
     return jnp.moveaxis(truth[:, None] - mean, 2, 0)
 
 
 def _claimed(part: Estimate) -> jax.Array:
-    """The covariance as (n, n, time, part, run)."""
+    """Claimed covariance as (n, n, time, part, run)."""
     value = jnp.asarray(part.covariance)
     return value.reshape(len(value), -1, *value.shape[-3:]).transpose(2, 3, 0, 1, 4)
 
@@ -282,14 +301,17 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
 
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
+    # The axis of batches first.
     sums = carry.count, carry.pairs, carry.nees, carry.claimed
     count, pairs, nees, local = (
         np.moveaxis(np.asarray(part), -1, 0) for part in sums
     )  # views: they are last in memory
+    # Mean claimed covariances.
     local = local / np.maximum(count, 1.0).reshape(-1, *[1] * (local.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     result, place = {}, 0
+    # Rows of each part, in the order of the sums.
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
         rows = slice(place, place + int(np.prod(axes)))
@@ -306,7 +328,12 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
-    """Statistics of one filter of one node from kept trajectories.
+    """Compute the statistics of one filter of one node from stored trajectories.
+
+    Args:
+        record: a record of Monte Carlo runs.
+        node: name of the node.
+        name: name of the filter.
 
     Raises:
         ValueError: a record without truth, or without a run axis.
@@ -314,10 +341,12 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     instance("record", record, Record, "a Record")
     if record.truth is None or record.truth.ndim != 3:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
+    # The filter's estimates.
     known = [(element, of) for element, filters in record.estimates.items() for of in filters]
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]
+    # The sums of a simulation, in which this is the only estimate.
     sums = _of_record(record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
     count, (parts,) = _split(sums, [])
     sent = record.uplinks.get(name) if node == FUSED else None
@@ -327,7 +356,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 
 @compiled
 def _of_record(truth: Array, mean: Array, covariance: Array) -> Sums:
-    """Sums over the runs of a record, block by block."""
+    """Sum over the runs of a record, block by block."""
     runs = len(truth)
     blocks = jnp.arange(-(-runs // BLOCK) * BLOCK).reshape(-1, BLOCK)
 

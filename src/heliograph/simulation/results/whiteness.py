@@ -1,4 +1,4 @@
-"""Whether a filter's innovations remember: what a link with memory leaves behind in a filter that assumes none."""
+"""Whiteness of a filter's innovations: a test for memory of the links in a filter that assumes none."""
 
 from dataclasses import dataclass
 
@@ -20,13 +20,17 @@ from heliograph.simulation.likelihood import rows
 @readable
 @dataclass(frozen=True)
 class MemoryTest:
-    """Correlation of innovations at lags 1, 2, ..., its standard error, and what the data say of memory and its cost.
+    """Correlation of innovations in time, with standard errors, as a test for memory of the links.
 
-    p_value: of lag 1 if there were none. predictable: what it costs, the share of the innovations' variance that those
-    before them foretell; 0 for the best linear filter. power: mean square of the innovations over what the filter
-    claims, 1 where the claim holds (NaN where no covariance is known), with its standard error.
-
-    Shapes: correlation (lags,), standard_error (lags,).
+    Args:
+        correlation: at lags 1, 2, ... (lags,).
+        standard_error: of the correlation (lags,).
+        p_value: of lag 1 under the hypothesis of no memory.
+        predictable: the cost of memory: share of the innovations' variance that is predictable from earlier ones; 0 for
+            the best linear filter.
+        power: mean square of the innovations over the claimed one, 1 where the claim holds (NaN where no covariance is
+            known).
+        power_error: its standard error.
     """
 
     correlation: Float[np.ndarray, " lags"]
@@ -38,24 +42,31 @@ class MemoryTest:
 
     @property
     def significant(self) -> bool:
-        """Whether innovations one step apart are correlated, at 1 %."""
+        """True if innovations one step apart are correlated, at 1 %."""
         return self.p_value < 0.01
 
 
 def memory_test(
-    data: ArrayLike, filter: AbstractFilter | None = None, inputs: ArrayLike | None = None, lags: int = 10
+    data: Float[ArrayLike, "steps received"],
+    filter: AbstractFilter | None = None,
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
+    lags: int = 10,
 ) -> MemoryTest:
-    """Tell from data whether links remember what a filter assumes they forget.
+    """Test from data whether links have memory that a filter ignores.
 
-    `data` are the measurements that the filter hears, or without a filter innovations; NaN did not arrive. The best
-    linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the modes.
-    Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
+    The best linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the
+    modes. Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
 
-    Shapes: data (steps, received), inputs (steps, inputs).
+    Args:
+        data: measurements of the filter (steps, received), or without a filter innovations; NaN did not arrive.
+        filter: a filter that claims a covariance; None by default.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+        lags: number of lags; 10 by default.
 
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance, too few steps for the lags,
             innovations that are all zero or missing.
+
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
@@ -64,7 +75,7 @@ def memory_test(
 
 
 def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> MemoryTest:
-    """What whitened innovations say; of their power alone where they are in units of what a filter claims.
+    """Test whitened innovations; their power only where they are in units of a filter's claim (`claimed`).
 
     Raises:
         ValueError: too few steps for the lags, nothing but zeros.
@@ -73,9 +84,11 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
         raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
     if not np.any(np.nan_to_num(white)):
         raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
+    # Correlations and their standard errors by lag.
     size, size_error = _mean(_by_step(white**2))
     parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
+    # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
     p_value = float(2 * stats.norm.sf(abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
     share = float(correlation @ np.linalg.lstsq(toeplitz([1.0, *correlation[:-1]]), correlation)[0])
     power = (size, size_error) if claimed else (np.nan, np.nan)
@@ -93,13 +106,18 @@ def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
 
 
 def whitened_innovations(
-    data: ArrayLike, filter: AbstractFilter, inputs: ArrayLike | None = None
+    data: Float[ArrayLike, "steps received"],
+    filter: AbstractFilter,
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
 ) -> Float[np.ndarray, "steps m"]:
-    """Innovations of a recording in units of what the filter claims: white and of variance 1 where the claim holds.
+    """Innovations of a recording in units of the filter's claim: white and of variance 1 where the claim holds.
 
     L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could.
 
-    Shapes: data (steps, received), inputs (steps, inputs).
+    Args:
+        data: measurements of the filter (steps, received), NaN where a component did not arrive.
+        filter: a filter that claims a covariance.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
 
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
@@ -114,13 +132,16 @@ def whitened_innovations(
 
 
 def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
-    """Mean over the components that are there; NaN where none is."""
+    """Mean over the components that are not NaN; NaN where none is."""
     there = np.sum(~np.isnan(parts), axis=1)
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
 
 
 def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Mean of what is not NaN, and its standard error by Bartlett's weights over the cube root of the length."""
+    """Mean of the values that are not NaN, and its standard error by Bartlett's weights.
+
+    The weights reach over the cube root of the length.
+    """
     there = ~np.isnan(values)
     count = max(int(there.sum()), 1)
     mean = float(values[there].sum() / count)
@@ -134,7 +155,7 @@ def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 def innovations_of(
     item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance, by component.
+    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
     NaN where it did not arrive, or the components before it determine it.
     """

@@ -1,6 +1,6 @@
-"""Runs side by side under XLA, each number once: what all runs share has no axis of runs.
+"""Runs in parallel under XLA, with values that all runs share computed once, without an axis of runs.
 
-It is found in the traced step: a result that does not depend on the key is common to all runs.
+They are found in the traced step: a result that does not depend on the key is common to all runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,21 +15,24 @@ from jaxtyping import PyTree
 def trajectories(
     init: Callable[[jax.Array], PyTree], step: Callable[..., tuple[PyTree, PyTree]], keys: jax.Array, rows: PyTree
 ) -> PyTree:
-    """What `step(carry, key, row)` gives from `init(key)` on, (run, time, ...); (1, time, ...) if common to all runs.
+    """Outputs of `step(carry, key, row)` from `init(key)` on, (run, time, ...); (1, time, ...) if common to all runs.
 
-    The runs are the last axis of everything on the way: a processor works through them without a jump.
+    The axis of runs is the last one of every array inside: a processor works through them contiguously.
     """
     start, varies, tree = _start(init, keys)
     example = jax.tree.map(lambda leaf: leaf[0], rows)
     item = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
+    # One run's step, without operations that no result needs.
     traced, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
     )(item, keys[0], example)
     body = _needed(traced)
     known = [False] * len(jax.tree.leaves(example))
+    # Parts of the carry that depend on the key, as a fixed point; then those of the outputs.
     spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(item)], varies)
     differ = _dependent(body, [*spread, True, *known])[len(item) :]
     row_axes: list[int | None] = [None] * len(known)
+    # The step for all runs: an axis of runs only where values differ.
     advance = jax.vmap(jaxpr_as_fun(body), in_axes=[*_axes(spread), 0, *row_axes], out_axes=_axes([*spread, *differ]))
 
     def scanned(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -39,22 +42,25 @@ def trajectories(
     begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
              for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
     outcome = jax.lax.scan(scanned, begin, rows)[1]
+    # The axis of runs first again.
     result = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(outcome, differ, strict=True)]
     return jax.tree.unflatten(jax.tree.structure(shape[1]), result)
 
 
 def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
-    """A function of one run's values for all runs: (run, ...), or (1, ...) where they share it, given and told.
+    """Apply a function of one run's values to all runs: (run, ...), or (1, ...) where they share it, in and out.
 
-    A result of which no run's own value has a part is computed once.
+    A result that depends on no value of single runs is computed once.
     """
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
     item = [leaf[0] for leaf in leaves]
+    # Which results depend on values of single runs.
     traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*item)
     expected = range(len(traced.jaxpr.outvars))
     tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in expected])[1]) for i in expected]
+    # The axis of runs last inside, first outside.
     over = jax.vmap(
         jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(tells), axis_size=runs
     )  # runs last, as everywhere
@@ -75,13 +81,13 @@ def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[j
 
 
 def _needed(program: ClosedJaxpr) -> ClosedJaxpr:
-    """A program without what none of its results needs, such as likelihoods that nobody asks for."""
+    """Program without operations that none of its results needs, such as unused likelihoods."""
     jaxpr, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
     return ClosedJaxpr(jaxpr, program.consts)
 
 
 def _marked(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
-    """What depends on the marked inputs; each operation is taken to use all that it is given."""
+    """Variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
     marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
     for operation in program.jaxpr.eqns:
         if any(v in marked for v in operation.invars if not isinstance(v, Literal)):
@@ -90,13 +96,13 @@ def _marked(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
 
 
 def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
-    """Which results depend on the marked inputs."""
+    """Mask of the results that depend on the marked inputs."""
     marked = _marked(program, inputs)
     return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 
 
 def _unchanging(following: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """The marks of a carry that following ones add nothing to."""
+    """Fixed point of the marks of a carry under a step."""
     more = [a or b for a, b in zip(marks, following(marks), strict=True)]
     return marks if more == marks else _unchanging(following, more)
 

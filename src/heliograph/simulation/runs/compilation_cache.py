@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk, so that a second process does not compile them again."""
+"""Cache of compiled programs on disk, so that a second process does not compile them again."""
 
 import os
 import sys
@@ -11,21 +11,21 @@ SECONDS = 0.1  # what compiles faster than this is not worth a file
 
 
 def keep_compilations(folder: str | Path | None = None) -> Path:
-    """Keep compiled programs in `folder` from now on, in this process and those it starts; returns the folder.
+    """Store compiled programs in `folder` from now on, in this process and those it starts; return the folder.
 
     Without `folder`: heliograph/compilations in the user's cache folder. The command line does this by itself; a
     library changes no settings unless asked. Where JAX_COMPILATION_CACHE_DIR is set, that folder is used and nothing is
-    changed.
-
-    What it holds is run: the folder is made for its user alone, and closed to others where it was open.
+    changed. Stored programs are executed: the folder is made for its user alone, and closed to others where it was
+    open.
 
     Raises:
-        ValueError: a folder that cannot be made, or that is not the user's own; no folder, and no home.
+        ValueError: a folder that cannot be made, or that belongs to another user; no folder, and no home.
     """
     if os.environ.get(FOLDER):
         return Path(os.environ[FOLDER])
     place = _default() if folder is None else Path(folder)
     _make_private(place)
+    # Settings for JAX, read from the environment or changed where it is loaded already.
     os.environ[FOLDER] = str(place)
     shortest = float(os.environ.setdefault(SHORTEST, str(SECONDS)))
     if "jax" in sys.modules:  # it has read the environment already

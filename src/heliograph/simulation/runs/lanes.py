@@ -1,7 +1,7 @@
-"""Blocks of runs dealt to lanes that work side by side: threads on a processor, one vectorised axis on other devices.
+"""Blocks of runs dealt to parallel lanes: threads on a processor, one vectorised axis on other devices.
 
 Block j goes to lane j mod LANES whatever the number of cores, and each lane sums its blocks in order, so that neither
-chunks nor cores change a bit of a result. Several devices share the lanes by JAX's own sharding.
+chunks nor cores change a bit of a result. Several devices share the lanes by JAX's sharding.
 """
 
 import os
@@ -21,16 +21,16 @@ BLOCK = 32  # runs simulated side by side: wide enough for vector units, small e
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 
-Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs and a carry -> carry, what is kept
+Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs, carry -> carry, collected results
 
 
 def one_processor() -> bool:
-    """Whether JAX sees nothing but a processor."""
+    """Test whether JAX sees nothing but a processor."""
     return len(jax.devices()) == 1 and jax.default_backend() == "cpu"
 
 
 class Lanes:
-    """The carries of all lanes, and how to advance them over the blocks of a chunk.
+    """Carries of all lanes, and their advance over the blocks of a chunk.
 
     `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
     """
@@ -44,14 +44,14 @@ class Lanes:
         self.pool: ThreadPoolExecutor | None = None
 
     def blocks_of(self, runs: int) -> int:
-        """Blocks of a chunk that holds this many runs at least: fewer than there are lanes, or a multiple of them."""
+        """Number of blocks of a chunk of at least this many runs: fewer than there are lanes, or a multiple of them."""
         blocks = -(-runs // BLOCK)
         if blocks < self.count and not self.wide:
             return blocks
         return self.count * -(-blocks // self.count)
 
     def advance(self, start: int, blocks: int) -> PyTree:
-        """Simulate `blocks` blocks from number `start` on; returns what is kept of them, run by run, on the host."""
+        """Simulate `blocks` blocks from number `start` on; return what is collected, run by run, on the host."""
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
@@ -81,7 +81,7 @@ class Lanes:
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
-        """The lanes' carries added up, in their order."""
+        """Sum of the lanes' carries, in their order."""
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
@@ -92,7 +92,7 @@ class Lanes:
 
 @partial(jax.jit, donate_argnums=0)
 def _plus(total: PyTree, more: PyTree) -> PyTree:
-    """In place: of many nodes these are hundreds of megabytes, which take longer to ask for than to add."""
+    """Add in place: of many nodes these are hundreds of megabytes, which take longer to allocate than to add."""
     return jax.tree.map(jnp.add, total, more)
 
 

@@ -1,7 +1,7 @@
-"""Monte Carlo by native code: a whole run as one straight line of operations in a loop over time.
+"""Monte Carlo by native code: a whole run as straight-line code in a loop over time.
 
-The program is made once for networks that differ in numbers alone: their arrays are its arguments, which all runs
-share. Zeros and ones in them are known, for what they spare.
+The program is made once for networks that differ in numbers alone: their arrays are its arguments, common to all runs.
+Their zeros and ones are known when the program is made, to save operations.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ PLAIN = (0.0, 1.0, -1.0)  # numbers that are known in a program
 
 
 class Native(NamedTuple):
-    """A program for a network, with the network's numbers; `tree` is the structure of what is kept of a run."""
+    """A program for a network, with the network's numbers; `tree` is the structure of what is collected of a run."""
 
     begun: Begun
     tree: Any
@@ -44,21 +44,23 @@ def native(
     reducer: AbstractReducer[Any],
     later: Smoother | None = None,
 ) -> Native:
-    """The native code of a network's runs, of which a reducer keeps what its `of_step` says.
+    """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
-    With `later`, what is kept is a pair: of filtered and of smoothed estimates; and sums of surprise.
+    With `later`, the results are a pair: of filtered and of smoothed estimates; and sums of the NIS.
 
     Raises:
-        Unsupported: a program that native code does not take.
+        Unsupported: a program that native code does not support.
     """
     if type(reducer).of_step is AbstractReducer.of_step:
         raise Unsupported(f"{type(reducer).__name__}, which has no of_step")
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
+    # Arrays are arguments; everything else is part of the program.
     leaves, tree = jax.tree.flatten((world, later, inputs, reducer))
     held = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if h else None for leaf, h in zip(leaves, held, strict=True))
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
+    # One program for networks of one structure.
     try:
         made = _made(tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value))
     except TypeError as error:
@@ -73,7 +75,7 @@ def native(
 
 
 class _Known:
-    """What is known of an array when a program is made: its shape and type, zeros and ones, and all of integers."""
+    """Knowledge of an array when a program is made: its shape and type, zeros and ones, and all entries of integers."""
 
     def __init__(self, shape: tuple[int, ...], kind: str, known: bytes, values: bytes):
         self.shape, self.kind, self.known, self.values = shape, kind, known, values
@@ -87,7 +89,7 @@ class _Known:
 
     @classmethod
     def of(cls, array: np.ndarray) -> "_Known":
-        """Of an array."""
+        """Describe an array."""
         known = np.isin(array, PLAIN) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
         if array.size > LONG and _is_given(array):
             known[...] = False
@@ -95,13 +97,13 @@ class _Known:
         return cls(array.shape, array.dtype.str, known.tobytes(), values.tobytes())
 
     def numbers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which entries are known, and these, zeros in place of the others."""
+        """Mask of the entries that are known, and these, zeros in place of the others."""
         known = np.frombuffer(self.known, dtype=bool).reshape(self.shape)
         return known, np.frombuffer(self.values, dtype=self.kind).reshape(self.shape)
 
 
 def _is_given(array: np.ndarray) -> bool:
-    """Whether an array's numbers are arguments of a program: reals, and names' checksums. Other integers decide it."""
+    """Test whether an array is an argument of a program: reals, and checksums of names. Other integers are known."""
     return array.dtype.kind == "f" or array.dtype == np.uint32
 
 
@@ -109,7 +111,7 @@ def _is_given(array: np.ndarray) -> bool:
 def _made(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
 ) -> tuple[Accumulated, Any] | Unsupported:
-    """`_program`, or why there is none: either is found once. It hangs on JAX's way to count draws, `counting`."""
+    """Cached `_program`, or why there is none. It depends on JAX's way to count draws, `counting`."""
     try:
         return _program(tree, held, fixed, known)
     except Unsupported as error:
@@ -119,12 +121,13 @@ def _made(
 def _program(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...]
 ) -> tuple[Accumulated, Any]:
-    """The code of networks of one structure, and the structure of what is kept of a run.
+    """Compile the code of networks of one structure; also return the structure of what is collected of a run.
 
-    `held` and `fixed`: the leaves that are no numbers, a user's functions say.
+    `held` and `fixed`: the leaves that are no arrays, such as a user's functions.
     """
     form: list[Any] = []
 
+    # One run, from the key, the arrays and the run's number.
     def run(key: jax.Array, *leaves: Any) -> list[jax.Array]:
         *arrays, number = leaves
         items = iter(arrays)
@@ -137,12 +140,14 @@ def _program(
         form[:] = [structure, len(jax.tree.leaves(summed))]
         return results
 
+    # Traced in double precision, with the shapes alone.
     struct: Any = jax.ShapeDtypeStruct
     with jax.enable_x64(True):
         shapes: list[Any] = [struct(k.shape, np.dtype(k.kind)) for k in known]
         key = jax.eval_shape(lambda: jax.random.key(0))
         made, _ = traced(run, key, *shapes, struct((), jnp.uint32))
         program = _lowered(made, known)
+    # Sums over runs by batch; the rest is collected.
     structure, count = form
     numbers = len(program.inputs) - 1
     summed = tuple(n < count for n in range(len(program.outputs)))
@@ -150,7 +155,7 @@ def _program(
 
 
 def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
-    """What is kept of a run: stacked over time, but for what was ever so at some step."""
+    """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
         state, result = world.step(state, key, row)
@@ -163,7 +168,7 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
 def _smoothed(
     world: World, later: Smoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
-    """What is kept of a run's filtered and smoothed estimates, each step by step, and its sums of surprise."""
+    """Collect the results of a run's filtered and smoothed estimates, step by step, and its sums of the NIS."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         return world.step(state, key, row)
@@ -172,6 +177,7 @@ def _smoothed(
         _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), result)
         return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
 
+    # The run with its smoother steps, then a backward pass.
     _, result = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     both = one_run(later.both, result)
     filtered, smoothed = recorded(both["filtered"]), recorded(both["smoothed"])
@@ -183,13 +189,15 @@ def _smoothed(
 
 
 def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
-    """The graph of a traced run: inputs are the key, the arrays that are given, and the run's number."""
+    """Graph of a traced run: inputs are the key, the arrays that are arguments, and the run's number."""
     lowering = Lowering()
     graph = lowering.graph
+    # Key and number of the run.
     words = Buffer("input", "u32", (2,), graph.top)
     number = Buffer("input", "u32", (), graph.top)
     inputs = [words]
     values: list[Any] = [keys_of(InMemory.whole(words).nodes(graph))]
+    # Known arrays are constants; of arguments only zeros and ones are.
     for item in known:
         fixed, numbers = item.numbers()
         if not _is_given(numbers):

@@ -38,17 +38,19 @@ def natively(
     progress: Progress | None,
     part: Part | None = None,
 ) -> Result | None:
-    """What a reducer makes of a network's runs, of which `part` is smoothed.
+    """Simulate a network by native code and reduce its runs; `part` of it is smoothed.
 
-    None where native code does not take the network or the reducer. Draws depend on names alone, and so do nodes that
-    share nothing but the plant: they are simulated a few at a time.
+    Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
+    nodes that share nothing but the plant: they are simulated a few at a time.
     """
+    # With smoothing: one program for filtered and smoothed estimates.
     if part is not None:
         both: WithSmoothed[Result] = WithSmoothed(reducer)
         code = attempted(lambda: _code(network, inputs, key, reducer, part))
         if code is None:
             return None
         return both.finished(*_recorded(code, both, first_run, runs, chunk, progress), network, part)
+    # Few nodes, or nodes that share something: one program.
     if len(network.names) <= NODES or not _is_apart(network) or type(reducer).joined is AbstractReducer.joined:
         code = attempted(lambda: _code(network, inputs, key, reducer))
         return (
@@ -56,6 +58,7 @@ def natively(
             if code is None
             else reducer.finish(*_recorded(code, reducer, first_run, runs, chunk, progress), network)
         )
+    # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
         code = attempted(lambda: _code(some, inputs, key, reducer))  # noqa: B023
@@ -71,13 +74,13 @@ def natively(
 
 
 def _is_apart(network: Network) -> bool:
-    """Whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory of a channel."""
+    """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
     local = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
     return len(local) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in local)
 
 
 def _parts(network: Network) -> Iterator[Network]:
-    """Networks of a few nodes each, those of one structure together."""
+    """Yield networks of a few nodes each, those of one structure together."""
     for names in network.groups:
         for start in range(0, len(names), NODES):
             yield Network(network.plant, {name: network.nodes[name] for name in names[start : start + NODES]})
@@ -95,7 +98,7 @@ def _code(
 def _recorded(
     code: Native, reducer: AbstractReducer[Any], first_run: int, runs: int, chunk: int, progress: Progress | None
 ) -> tuple[PyTree, PyTree]:
-    """What the reducer holds after all runs, and what it collected of them, chunk by chunk."""
+    """Carry of the reducer after all runs, and what it collected of them, chunk by chunk."""
     lanes = NativeLanes(code, first_run, first_run + runs)
     blocks = lanes.blocks_of(min(chunk, runs))
     parts = []
@@ -107,7 +110,7 @@ def _recorded(
 
 
 class NativeLanes:
-    """Blocks of runs dealt to lanes, each with sums of its own: as `Lanes`, computed by native code.
+    """Blocks of runs dealt to lanes with separate sums: `Lanes` computed by native code.
 
     Block j goes to lane j mod LANES whatever the number of cores, and each lane adds its blocks in order, so that
     neither chunks nor cores change a bit of a result.
@@ -118,12 +121,12 @@ class NativeLanes:
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
 
     def blocks_of(self, runs: int) -> int:
-        """Blocks of a chunk that holds this many runs at least: fewer than there are lanes, or a multiple of them."""
+        """Number of blocks of a chunk of at least this many runs: fewer than there are lanes, or a multiple of them."""
         blocks = -(-runs // BLOCK)
         return blocks if blocks < LANES else LANES * -(-blocks // LANES)
 
     def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; what is collected of their runs, in order, leaf by leaf."""
+        """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
         numbers = np.arange(start, start + blocks)
         dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
         used = [lane for lane, runs in dealt.items() if len(runs)]
@@ -141,12 +144,14 @@ class NativeLanes:
         return runs[runs < self.stop]
 
     def total(self, reducer: AbstractReducer[Any]) -> PyTree:
-        """The reducer's carry after all runs."""
+        """Carry of the reducer after all runs."""
+        # Sums of the lanes, by batch.
         used = [sums for sums in self.sums if sums is not None]
         totals = iter([folded(reduce(np.add, parts), BATCHES) for parts in zip(*used, strict=True)])
         code = self.code.begun
         summed = code.program.summed.outputs
         leaves, common = [], []
+        # Results that all runs share stand as of one run.
         for item, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
             value = next(totals) if is_summed else None
             leaves.append(item if shared else value)
@@ -156,7 +161,7 @@ class NativeLanes:
         return reducer.summed(sums, same, count)
 
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """What was collected of all runs, (run, ...); a view of one where they share it."""
+        """Collected results of all runs, (run, ...); a view of one where they share it."""
         leaves: list[Any] = []
         for item, *single in zip(self.code.begun.shared, *parts, strict=True):
             if item is not None:

@@ -1,4 +1,4 @@
-"""A computation on one run, done for many: side by side in blocks that stay in the cache, on all cores."""
+"""Computation on one run, applied to many: in parallel, in blocks that fit the cache, on all cores."""
 
 import os
 from collections.abc import Callable
@@ -13,16 +13,21 @@ from heliograph.numerics.compiler import fully_optimised
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 
-WIDTH = 128  # runs side by side: what a hundred steps of them retain for a sweep back stays near the core
+WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache
 
 
 def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WIDTH) -> PyTree:
     """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
 
     The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
-    and its shapes, so define it once. NumPy arrays come back, and each core takes its share of the runs. Native code
-    computes them, or XLA, `width` runs side by side, what native code does not take (`heliograph.codegen.engine_of`
-    says which).
+    and its shapes, so define it once. NumPy arrays come back, and each core computes its share of the runs. Native code
+    computes them, or XLA, `width` runs in parallel, for functions that native code does not support
+    (`heliograph.codegen.engine_of` says which).
+
+    Args:
+        function: of one run's arrays.
+        arrays: arrays (run, ...) of numbers, with one number of runs.
+        width: runs in parallel under XLA; 128 by default.
 
     Raises:
         ValueError: no arrays, or arrays with different numbers of runs.
@@ -30,15 +35,18 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     if not callable(function):
         raise fail("function over runs", "a function of one run's arrays", shown(function))
     check_count("width", width)
+    # Arrays of numbers with one leading axis.
     values = [_numbers(a) for a in arrays]
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
+    # Native code where it supports the function.
     choice = chosen(function, values, [True] * len(values))
     return choice.results() if choice.code is not None else _by_xla(function, values, width)
 
 
 def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
-    """The same as a program of XLA, `width` runs side by side."""
+    """Apply the function as a program of XLA, `width` runs in parallel."""
+    # Width and blocks such that all cores are busy and little is padding.
     runs, cores = len(values[0]), os.cpu_count() or 1
     width = min(width, runs)
     share = -(-runs // (width * cores))  # blocks of each core
@@ -51,6 +59,7 @@ def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: in
             result = to_numpy(_blocks(function, parts))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], result)
 
+    # Each core computes its blocks, then copies them to their place.
     with ThreadPoolExecutor(cores) as pool:
         result = list(pool.map(work, range(-(-runs // (share * width)))))
         whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), result[0])
@@ -75,7 +84,7 @@ def _numbers(value: PyTree) -> np.ndarray:
 
 
 def _filled(part: np.ndarray, count: int) -> np.ndarray:
-    """As many runs as the program wants; the last one again where there are fewer."""
+    """Pad to `count` runs with copies of the last one."""
     missing = count - len(part)
     return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
 
