@@ -123,12 +123,13 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
     """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
     items = jnp.arange(last + 1)
+    # Begin at the newest step that each one may use.
     ends = rows_of(steps, jnp.minimum(items + lag, last))
     newest = jax.vmap(lambda step: step.end())(ends)
     start = newest, jax.vmap(lambda step, later: step.smoothed(later))(ends, newest)
 
     def body(done: jax.Array, carry: tuple[PyTree, Moments]) -> tuple[PyTree, Moments]:
-        """From after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
+        """Pass from after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
         later, known = carry
         ahead = items + lag - done
         place = jnp.minimum(ahead, last)

@@ -11,6 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
+from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
@@ -115,7 +116,8 @@ class MixedCross(AbstractFilter):
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        after, innovation = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
+        size = initial_size(self.base.initial_mean, self.base.initial_covariance)
+        after, innovation = corrected(prior, signal, channel, self.base.update, jnp.asarray(z), size)
         return Propagated(*after, state.points), innovation
 
     def estimate(self, state: Propagated) -> Estimate:

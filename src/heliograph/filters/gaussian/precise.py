@@ -95,7 +95,7 @@ def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after:
 
 
 class _Taken(NamedTuple):
-    """After some components: the root R (n, n) of P, that of the mean's rounding (n, n), and two gains of T z (n, m).
+    """State after some components: the root R (n, n) of P, that of the mean's rounding (n, n), and two gains of T z (n, m).
 
     gain: of components of which more than rounding was unknown, which P+ is made of; whole: of all.
     """
@@ -107,7 +107,7 @@ class _Taken(NamedTuple):
 
 
 def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
-    """With one component more."""
+    """Roots and gains with one component more."""
     before, rounded, gain, whole = state
     f = times_vector(transpose(before), item.row)
     total = summed(f * f, 0) + item.variance
