@@ -129,7 +129,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
     start = newest, jax.vmap(lambda step, later: step.smoothed(later))(ends, newest)
 
     def body(done: jax.Array, carry: tuple[PyTree, Moments]) -> tuple[PyTree, Moments]:
-        """Pass from after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
+        """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
         later, known = carry
         ahead = items + lag - done
         place = jnp.minimum(ahead, last)

@@ -95,7 +95,7 @@ def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after:
 
 
 class _Taken(NamedTuple):
-    """State after some components: the root R (n, n) of P, that of the mean's rounding (n, n), and two gains of T z (n, m).
+    """State after some components: roots of P and of the mean's rounding, R (n, n), and two gains of T z (n, m).
 
     gain: of components of which more than rounding was unknown, which P+ is made of; whole: of all.
     """
