@@ -77,7 +77,7 @@ def test_a_fused_filter_is_refused_flags_of_another_step():
 def test_erasures_are_refused_when_it_is_made(make):
     lossy = hg.gilbert_elliott(hg.erasure(HOP, 0.9), HOP, 0.2, 0.2)
     with pytest.raises(
-        ValueError, match=r"told the mode: expected a channel without erasures .*side_information_filter"
+        ValueError, match=r"observes the mode: expected a channel without erasures .*side_information_filter"
     ):
         make(PLANT, SENSOR, lossy)
     with pytest.raises(ValueError, match="without erasures"):

@@ -130,7 +130,7 @@ def test_runs_and_streams_give_what_was_simulated(net, record):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda f, n: hg.Fusion("own", f.MatrixWeights(), uplink=f.ReportLink(every=2)), "a rule that hears reports"),
+        (lambda f, n: hg.Fusion("own", f.MatrixWeights(), uplink=f.ReportLink(every=2)), "a rule that uses reports"),
         (lambda f, n: hg.Fusion("own", f.AllReports(), uplink=f.ReportLink(hg.hop(1.0, 0.1))), "that takes 2 numbers"),
         (lambda f, n: hg.Fusion("own", f.AllReports(), uplink={"node 0": f.ReportLink()}), "one for each node of"),
         (lambda f, n: hg.Fusion("own", f.AllReports(), quantizer=f.EscapeQuantizer(9, 1.0, 0.9, 0.1, 0.1)),

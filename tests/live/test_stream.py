@@ -102,13 +102,15 @@ def test_a_polynomial_filter_goes_on_only_where_it_has_settled():
 
 def test_a_network_refuses_filters_that_do_not_fit_it():
     item = hg.kalman_filter(PLANT, SENSOR)
-    with pytest.raises(ValueError, match="filter 'f': expected one that hears the 1 numbers that arrive, got one that"):
+    with pytest.raises(
+        ValueError, match="filter 'f': expected one that receives the 1 numbers that arrive, got one that"
+    ):
         hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.5), hg.perfect(), {"f": item})
     still = hg.LinearPlant(PLANT.matrix, 0.1, [1.0, -1.0], 1.0)
     node = hg.Node(SENSOR, hg.perfect(2), {"f": item})
     with pytest.raises(ValueError, match="filter 'f' of node 'a': expected the plant's 0 inputs"):
         hg.Network(still, {"a": node})
-    with pytest.raises(ValueError, match="fused 'all': expected one that hears the 4 numbers that arrive"):
+    with pytest.raises(ValueError, match="fused 'all': expected one that receives the 4 numbers that arrive"):
         hg.Network(PLANT, {"a": node, "b": node}, {"all": item})
     hg.Network(PLANT, {"a": node, "b": node}, {"all": hg.filters.sequential_filter([item, item])})
 

@@ -61,11 +61,11 @@ def test_delays_in_series_add_up():
 
 
 REFUSED = {
-    "delays told: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, timestamped=True)]),
+    "time stamps: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, timestamped=True)]),
     "series: expected links that are late each": lambda: hg.amplify_and_forward(
         [LINK, hg.with_direct_link(delayed(LINK, 1), LINK)]
     ),
-    "delays told: expected those of one link": lambda: hg.amplify_and_forward(
+    "time stamps: expected those of one link": lambda: hg.amplify_and_forward(
         [delayed(LINK, LAW, timestamped=True), delayed(LINK, 1)]
     ),
     "link before a delay: expected one that forgets": lambda: hg.amplify_and_forward(

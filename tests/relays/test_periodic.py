@@ -75,7 +75,7 @@ def test_what_has_no_steady_state_is_refused(local):
     with pytest.raises(ValueError, match="varies with its slots only"):
         periodic_own_error_design(varying)
     loud = {name: 30 * gain for name, gain in local.gains.items()}
-    with pytest.raises(ValueError, match="second moments that settle, got growth by"):
+    with pytest.raises(ValueError, match="second moments that converge, got growth by"):
         periodic_given_design(net, loud)
     with pytest.raises(ValueError, match="some under which they diverge"):
         periodic_receiver_error_design(net, start=loud)

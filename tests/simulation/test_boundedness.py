@@ -102,7 +102,7 @@ def test_losses_on_two_hops_are_losses():
 def test_random_gains_that_are_not_told_bound_no_unstable_mode(channel, a):
     result = scalar(channel, a=[[a]])
     assert result.verdict == "impossible"
-    assert "only through random gains that are not told" in result.reason
+    assert "only through random gains that are not known" in result.reason
 
 
 def test_the_exact_filter_diverges_where_that_is_said():

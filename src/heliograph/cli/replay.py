@@ -22,7 +22,7 @@ def replay(
     loss: Annotated[float, Parameter(help="Probability that a message is lost.")] = 0.0,
     run: Annotated[float, Parameter(help="How many are lost in a row, on average; 1: each by itself.")] = 1.0,
     delay: Annotated[float, Parameter(help="Mean time on the way, of an exponential law: messages overtake.")] = 0.0,
-    duplicates: Annotated[float, Parameter(help="Probability that a message is heard twice.")] = 0.0,
+    duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
     trace: Annotated[Path | None, place("CSV of a recorded link, one delay a message, nan if lost.")] = None,
     seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
 ) -> None:

@@ -261,7 +261,7 @@ class Fusion(Module):
                 raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
             first(item).check(n)
             if first(item).silent and not self.rule.uses_reports:
-                expected = "a rule that hears reports (AllReports)"
+                expected = "a rule that uses reports (AllReports)"
                 raise fail(f"fusion through {type(first(item)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
             self._check_reports(nodes, n)
@@ -274,7 +274,7 @@ class Fusion(Module):
 
     def _check_reports(self, nodes: Sequence[str], n: int) -> None:
         if not self.rule.uses_reports:
-            raise fail("fusion over report links", "a rule that hears reports (AllReports)", type(self.rule).__name__)
+            raise fail("fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__)
         if isinstance(self.uplink, Mapping) and set(self.uplink) != set(nodes):
             raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
         for link in self.links(nodes):

@@ -86,7 +86,7 @@ def _the_node(network: Network) -> tuple[str, Node]:
     instance("network", network, Network, "a Network")
     received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(received) != 1 or len(network.nodes) != 1:
-        raise fail("network", "one node that hears its sensor through a channel", f"{len(network.nodes)} nodes")
+        raise fail("network", "one node that receives its sensor through a channel", f"{len(network.nodes)} nodes")
     return next(iter(received.items()))
 
 

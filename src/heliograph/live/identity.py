@@ -33,7 +33,7 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
         "precision": "single" if network.single else "double",
         "states": ", ".join(network.states),
         "inputs": ", ".join(network.inputs),
-        "nodes": ", ".join(f"{name} ({node.received} heard)" for name, node in network.nodes.items()),
+        "nodes": ", ".join(f"{name} ({node.received} received)" for name, node in network.nodes.items()),
         "filters": ", ".join(filters),
         **{f"option {name}": f"{value!r}" for name, value in options.items()},
         "numbers of the plant": short_name(network.plant),

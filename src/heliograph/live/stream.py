@@ -170,7 +170,7 @@ class _Placed:
             "filter": type(item).__name__,
             "states": ", ".join(item.states),
             "inputs": ", ".join(item.inputs),
-            "numbers heard": str(item.received),
+            "numbers received": str(item.received),
             "numbers": short_name(self.numbers),
             "what is computed": short_name(text),
         }

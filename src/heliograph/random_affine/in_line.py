@@ -116,7 +116,7 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     if len(stages) == 1:
         return _stage(stages[0])
     if any(isinstance(link, Delayed) and link.timestamped for link in links):
-        raise fail("delays told", "those of one link", "those of several in series")
+        raise fail("time stamps", "those of one link", "those of several in series")
     return Relayed(tuple(_stage(stage) for stage in stages))
 
 
@@ -130,7 +130,7 @@ def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
     timestamped = [link.timestamped for link in delays]
     if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and start is not None):
-        raise fail("delays told", "those of one link", "those of several in series")
+        raise fail("time stamps", "those of one link", "those of several in series")
     last = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
     for link in links[:last]:
         if link.remembers:

@@ -52,7 +52,7 @@ def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
     instance("network", network, RelayNetwork, "a RelayNetwork")
     result, change = _solve_own_steady(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
-        raise fail("steady state", "moments that settle", f"a change of {float(change):.2g} after {PERIODS} periods")
+        raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
     return as_design(network, result)
 
 
@@ -69,7 +69,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     result = _steady(steps, joined)
     radius = float(_growth(steps, joined))
     if not radius < 1:
-        raise fail("periodic gains", "second moments that settle", f"growth by {radius:.4g} per period")
+        raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
     return as_design(network, result)
 
 
@@ -85,7 +85,7 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     joined, steps = _period(network, relay_gains(network, gains)), periodic_steps(network)
     radius = float(_growth(steps, joined))
     if not radius < 1:
-        raise fail("periodic gains", "second moments that settle", f"growth by {radius:.4g} per period")
+        raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
     n = len(network.states)
     return np.asarray(_steady_behind(steps, joined))[:, :n, :n]
 

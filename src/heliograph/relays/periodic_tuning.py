@@ -83,7 +83,7 @@ def _tune(
     limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
-        raise fail("start of the search", "gains under which second moments settle", "some under which they diverge")
+        raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
     for _ in range(ROUNDS if power_limit is not None else 1):
 
         def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:

@@ -219,7 +219,7 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
     caption = (
         f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
         "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
-        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
+        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it receives."
     )
     blocks: list[Table | Picture] = [Table(headers, rows, caption)]
     if "innovations" in drawings:
@@ -253,7 +253,7 @@ def _losses(learned: Learned) -> list[Section]:
             best = "best" if name == loss.best else ""
             rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
     caption = (
-        "Laws of the losses that the receiver is told of, with 95 % intervals, and what each predicts of the last "
+        "Laws of the losses that the receiver knows of, with 95 % intervals, and what each predicts of the last "
         "third of the rows: log-likelihood per packet, less that of independent losses. `hg.learning.learn_losses` "
         "makes a "
         "channel of them."

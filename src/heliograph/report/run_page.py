@@ -173,7 +173,7 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     caption = (
         "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
         "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
-        "one row apart: 0 where the filter uses all that it hears. Both with 95 % intervals; **p**: probability of "
+        "one row apart: 0 where the filter uses all that it receives. Both with 95 % intervals; **p**: probability of "
         "such a correlation if there were none."
     )
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."

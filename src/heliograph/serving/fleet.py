@@ -140,7 +140,7 @@ class Fleet:
 
     def trial(
         self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
-    ) -> Float[np.ndarray, "plant told"]:
+    ) -> Float[np.ndarray, "plant outputs"]:
         """What the filters of each plant (None: one that has not begun) would tell with these inputs, NaN as they were.
 
         After a step from the newest row, or over one unit of time, in which nothing is heard.

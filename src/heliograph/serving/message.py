@@ -42,9 +42,9 @@ class Message(BaseModel):
     node: Name = Field(description='A node of the network, or "inputs": then the values are the plant\'s inputs.')
     sequence: int = Field(ge=0, lt=2**63, description="The node's own count; gaps in it are what was lost.")
     time: Moment = Field(description="When it was measured: steps, seconds, or an ISO 8601 date with a zone.")
-    values: list[float | None] = Field(default=[], description="What was heard; null did not arrive.")
+    values: list[float | None] = Field(default=[], description="Values received; null did not arrive.")
     inputs: list[float | None] | None = Field(None, description="The plant's inputs without dt; null stays as it was.")
-    arrival: Moment | None = Field(None, description="When it was heard; at once if left out.")
+    arrival: Moment | None = Field(None, description="Time of arrival; at once if left out.")
 
 
 _READER = TypeAdapter(Message)

@@ -24,15 +24,19 @@ class FilterOutput(BaseModel):
     mean: list[float | None]
     covariance: list[list[float | None]] | None = Field(description="Null of a filter that claims none.")
     claim: Claim = Field(description="What the covariance is: exact, upper, nominal; none also where it is no number.")
-    nis: float | None = Field(None, description="Normalised innovation squared of what was heard; null if nothing was.")
-    received: int = Field(0, description="How many numbers were heard: what nis should be on average.")
-    implausible: str = Field("", description="Why this filter alone did not use what was heard, where it did not.")
+    nis: float | None = Field(
+        None, description="Normalised innovation squared of what was received; null if nothing was."
+    )
+    received: int = Field(0, description="How many numbers were received: what nis should be on average.")
+    implausible: str = Field("", description="Why this filter alone did not use what was received, where it did not.")
 
 
 class Estimates(BaseModel):
     """The filters of a plant after the row at `time`, by node and filter; those of several nodes under "fused"."""
 
-    id: int | None = Field(None, description="Of final ones: counts what is told once; told again it is the same.")
+    id: int | None = Field(
+        None, description="Of final ones: counts what is published once; published again it is the same."
+    )
     kind: Literal["provisional", "final"] = Field(description="Provisional ones may change by what comes late.")
     plant: str
     time: float | str

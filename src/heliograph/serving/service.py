@@ -143,7 +143,7 @@ class Service:
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
             what = f"message {message.sequence} of {message.node!r} {plant}is implausible"
-            self._say(f"warning: {what}: {why}; such messages are told as refused and counted, and not said again")
+            self._say(f"warning: {what}: {why}; such messages are reported as refused and counted, and not said again")
             self._say = None
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:

@@ -98,8 +98,8 @@ class Watch:
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._count = 0
         self.registry = CollectorRegistry()
-        self.took = Histogram("heliograph_batch_seconds", "From messages to what is told.", registry=self.registry)
-        what = "From when the oldest message of a batch was measured, where it has a date, to what is told."
+        self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
+        what = "From when the oldest message of a batch was measured, where it has a date, to what is published."
         self.lag = Histogram("heliograph_lag_seconds", what, buckets=LAGS, registry=self.registry)
         self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
 

@@ -54,4 +54,4 @@ def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return z[:, :-1], z[:, -1]
     if isinstance(item, Delayed) and item.constant:
         return z, np.full(len(z), float(item.past))
-    raise fail(f"delays of node {name!r}", "constant ones, or told ones", "random ones that nobody is told")
+    raise fail(f"delays of node {name!r}", "constant ones, or time stamps", "random ones without time stamps")

@@ -255,7 +255,7 @@ def _why(links: Links, system: KnownLossSystem, unseen: Unseen) -> str:
     powers = [np.einsum("iiab->ab", second_moments(o.map)[1])[:-1, :-1] for outcome in links.outcomes for o in outcome]
     seen = links.sensing @ unseen.vectors
     if max(float(np.real(np.einsum("ad,ab,bd->", seen.conj(), power, seen))) for power in powers) > 0:
-        return f"{mode} is seen only through random gains that are not told, which make noise as large as the state"
+        return f"{mode} is seen only through random gains that are not known, which make noise as large as the state"
     return f"{mode} is not seen at all"
 
 

@@ -64,7 +64,11 @@ class Node(Module):
             check_flags(f"filter {name!r}", item, [first(channel)])
         observation = [name for name, item in self.filters.items() if item.received]
         if self.informed_by is not None and observation != [self.informed_by]:
-            raise fail("node whose sensor hears back", f"no filter that hears beside {self.informed_by!r}", observation)
+            raise fail(
+                "node whose sensor has feedback",
+                f"no filter with measurements besides {self.informed_by!r}",
+                observation,
+            )
 
     @property
     def received(self) -> int:
@@ -130,7 +134,7 @@ def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
 def check_received(name: str, item: AbstractFilter, received: int) -> None:
     """Refuse a filter of another number of components than arrive, unless it uses no measurements."""
     if item.received not in (0, received):  # 0: it uses no measurements
-        raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
+        raise fail(name, f"one that receives the {received} numbers that arrive", f"one that receives {item.received}")
 
 
 def check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:

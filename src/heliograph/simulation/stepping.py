@@ -33,7 +33,7 @@ from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
-from heliograph.smoothing.sweep import planned_with_past
+from heliograph.smoothing.backward_pass import planned_with_past
 
 
 class AllFilters(Module):

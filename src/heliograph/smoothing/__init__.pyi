@@ -10,6 +10,6 @@ from .planned import (
     PlannedSmoother as PlannedSmoother,
     planned_smoother as planned_smoother,
 )
-from .sweep import (
+from .backward_pass import (
     smoother_steps as smoother_steps,
 )

@@ -13,8 +13,8 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
+from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag
 from heliograph.smoothing.consistency import nis_sums, warn_of
-from heliograph.smoothing.sweep import carried_ahead, swept, swept_means, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
 
@@ -53,7 +53,7 @@ class AbstractSmoothing(Module):
 
 @compiled
 def _swept(smoothing: AbstractSmoothing, steps: AbstractSmootherStep) -> Estimate:
-    return smoothing.sweep(steps)
+    return smoothing.backward_pass(steps)
 
 
 class FixedInterval(AbstractSmoothing):

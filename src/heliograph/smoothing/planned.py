@@ -11,8 +11,8 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.smoothing.backward_pass import planned_with_past, quiet_steps, stepped
 from heliograph.smoothing.modes import AbstractSmoothing
-from heliograph.smoothing.sweep import planned_with_past, quiet_steps, stepped
 
 
 @readable
@@ -75,4 +75,4 @@ def _planned(item: AbstractFilter, u: Array) -> AbstractFilter | None:
 
 @compiled
 def _estimate(item: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    return smoothing.sweep(quiet_steps(item, u))
+    return smoothing.backward_pass(quiet_steps(item, u))

@@ -11,7 +11,7 @@ from heliograph_studies.delays.setting import STEP
 LATE = {  # filter: how it is called, and its colour
     "as_current": ("taken as current", VERMILION),
     "untold": ("delays not told", BLUE),
-    "told": ("delays told", GREEN),
+    "told": ("time stamps", GREEN),
     "constant": ("all one step late", PURPLE),
     "none": ("not late", INK),
 }

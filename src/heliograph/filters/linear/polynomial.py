@@ -70,7 +70,9 @@ class PolynomialFilter(AbstractFilter):
         self.states, self.inputs = inner.states, inner.inputs
         fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
         if not fitting:
-            raise fail("inner filter", f"one that hears monomials up to degree {degree}", f"{inner.received} numbers")
+            raise fail(
+                "inner filter", f"one that receives monomials up to degree {degree}", f"{inner.received} numbers"
+            )
         self.received = fitting[0]
 
     @property

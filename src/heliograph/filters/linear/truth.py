@@ -74,8 +74,8 @@ def true_error(
     start, n = first(plant), len(first(plant).states)
     check_link(first(sensor), first(channel), n, late=True)
     if filter.received != first(channel).outputs or len(filter.states) != n:
-        got = f"one of {len(filter.states)} that hears {filter.received}"
-        raise fail("filter", f"one of {n} states that hears {first(channel).outputs} numbers", got)
+        got = f"one of {len(filter.states)} that receives {filter.received}"
+        raise fail("filter", f"one of {n} states that receives {first(channel).outputs} numbers", got)
     # Gains of the filter for these inputs.
     u = array("inputs", np.zeros((check_horizon(horizon), 0)) if inputs is None else inputs, (horizon, None))
     planned = filter.planned(u)

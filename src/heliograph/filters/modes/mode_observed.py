@@ -213,12 +213,12 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
 
 
 def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
-    check_linear("filter that is told the mode", plant, sensor)
+    check_linear("filter that observes the mode", plant, sensor)
     # Erasures are side information of another kind.
     steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
     if any(step.erases for step in steps if isinstance(step, AbstractRandomAffine)):
         expected = "a channel without erasures (side_information_filter with flags=np.eye(modes) takes them)"
-        raise fail("filter that is told the mode", expected, "one that loses packets")
+        raise fail("filter that observes the mode", expected, "one that loses packets")
     # Received: z and one number per memory.
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))

@@ -256,7 +256,7 @@ def side_information_filter(
 
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
-    check_linear("told filter", plant, sensor)
+    check_linear("side-information filter", plant, sensor)
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     # P(flag | mode); one flag that is always the same where there are none.

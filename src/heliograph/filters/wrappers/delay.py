@@ -254,8 +254,8 @@ def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: M
 
 def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
     if not isinstance(channel, Delayed):
-        raise fail("channel with told delays", "one that does not vary", "one in over_time")
-    check_forgets("link with told delays", channel.link)
+        raise fail("channel with time stamps", "one that does not vary", "one in over_time")
+    check_forgets("link with time stamps", channel.link)
     larger, everything, _ = with_past(plant, sensor, channel)
     items = [channel.given(d) for d in range(channel.past + 1)]
     base, start = make(larger, everything, items[0]), first(plant)

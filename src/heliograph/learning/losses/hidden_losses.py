@@ -1,4 +1,4 @@
-"""Losses of a link that is good or bad for a while, which nobody is told: its two-mode filter and its likelihood."""
+"""Losses of a link that is good or bad for a while, which nobody knows: its two-mode filter and its likelihood."""
 
 import numpy as np
 

@@ -27,7 +27,7 @@ from heliograph.serving.storage.tables import (
     is_whole,
 )
 
-PUBLISHED, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
+PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
 IDENTITY = "identity"
 AT_ONCE = 500  # names in one question
 MEND = "its plants go on in a new store with --store NEW --from-snapshot"

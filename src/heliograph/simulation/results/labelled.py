@@ -21,7 +21,7 @@ Part = tuple[tuple[int, ...], np.ndarray]  # where an array belongs, and the arr
 MEANING = {
     "truth": "true state",
     "measurement": "what reached the node, NaN where nothing arrived and beyond its length",
-    "length": "how many numbers the node hears; -1: it is no place that hears",
+    "length": "how many numbers the node receives; -1: it is no place that receives",
     "mean": "estimate of the state",
     "covariance": "covariance of the error as the filter claims it",
     "claim": "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
