@@ -88,7 +88,7 @@ class Smoother(Module):
             return function
 
         if len(steps.covariance) == len(steps.mean):
-            result: Estimate = each_run(over(self.smoothing.backward_pass), steps)
+            result: Estimate = each_run(over(self.smoothing.sweep), steps)
             return result
         covariances = each_run(over(self.smoothing.covariances), steps)
         return Estimate(each_run(over(self.smoothing.means), steps), covariances, steps.claim)

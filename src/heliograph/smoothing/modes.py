@@ -53,7 +53,7 @@ class AbstractSmoothing(Module):
 
 @compiled
 def _swept(smoothing: AbstractSmoothing, steps: AbstractSmootherStep) -> Estimate:
-    return smoothing.backward_pass(steps)
+    return smoothing.sweep(steps)
 
 
 class FixedInterval(AbstractSmoothing):

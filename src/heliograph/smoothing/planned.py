@@ -75,4 +75,4 @@ def _planned(item: AbstractFilter, u: Array) -> AbstractFilter | None:
 
 @compiled
 def _estimate(item: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    return smoothing.backward_pass(quiet_steps(item, u))
+    return smoothing.sweep(quiet_steps(item, u))
