@@ -11,13 +11,12 @@ import jax
 import numpy as np
 import numpy.typing
 from jaxtyping import Bool, Float, Int, Key, PyTree
-from typing_extensions import TypeAliasType
 
 Array: TypeAlias = jax.Array | np.ndarray
 if TYPE_CHECKING:
     ArrayLike: TypeAlias = numpy.typing.ArrayLike
 else:  # what a user gives is judged by numerics/check, in one clear line
-    ArrayLike = TypeAliasType("ArrayLike", Any)
+    ArrayLike = Any
 Scalar: TypeAlias = float | Float[Array, ""]
 
 __all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Key", "PyTree", "Scalar"]
