@@ -115,7 +115,10 @@ def _monomials(z: np.ndarray, order: int) -> np.ndarray:
 
 
 def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
-    """Means over samples (sample, number) against what is expected; the largest ratio to the standard error."""
+    """Compare means over samples (sample, number) with expected ones; return the largest |difference| / standard error.
+
+    The standard error is that of each mean.
+    """
     error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)
     scale = np.abs(seen).max(axis=0) + np.abs(expected)
