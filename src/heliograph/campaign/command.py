@@ -26,18 +26,19 @@ def sweep(
     setting: int | None = None,
     chunk: int | None = None,
 ) -> int:
-    """Run what is missing of a campaign, or only a setting or chunk of it in this process; returns the exit code.
+    """Run what is missing of a campaign, or one setting or chunk of it in this process; return the exit code.
 
     Raises:
         ValueError: as `load_campaign` and `run_campaign`; a chunk without its setting.
         ModuleNotFoundError: an extra of `sweep`, `report`, `cluster` is not installed.
     """
-    from heliograph.campaign.page import write_report  # a missing extra is told before the work starts
+    from heliograph.campaign.page import write_report  # a missing extra is reported before the work starts
 
     campaign = load_campaign(path)
     only = _only(campaign, setting, chunk)
     if only is not None and workers is None:
         workers = 0  # so that a debugger can follow
+    # Compute with a progress bar, then write the report from the new scores.
     with showing(workers or os.cpu_count() or 1) as tell:
         result = run_campaign(campaign, out, workers, scheduler, only, tell)
     scores = read_summary(out / SUMMARY)
@@ -46,6 +47,7 @@ def sweep(
     console = rich.console.Console()
     console.print(_done(result), soft_wrap=True, highlight=False, markup=False)
     console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
+    # Problems go to stderr: damaged files, and failures with the way to repeat them.
     for file in result.damaged:
         print(f"heliograph: damaged, so it does not count as done: {file}", file=sys.stderr)
     for failure in result.failures:

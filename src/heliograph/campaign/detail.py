@@ -1,4 +1,4 @@
-"""Scores of single states, over all steps and at some of them: the store read once more, chunk by chunk."""
+"""Scores of single states, over all steps and at some of them, from a second pass over the store."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,11 @@ from heliograph.campaign.store import CLAIM, done_chunks, stored_labels
 
 @dataclass(frozen=True)
 class Detail:
-    """One state of one filter over the finite runs, at a step counted from 1, or over all steps where `step` is 0.
+    """Scores of one state of one filter over the finite runs, at a step counted from 1, or over all steps (`step` 0).
 
-    claimed: root of the mean claimed variance. nees_per_dimension: mean of the squared error over the claimed variance,
-    1 if the claim is exact. Standard errors are from the scatter between runs; NaN without finite runs.
+    `claimed` is the root of the mean claimed variance, `nees_per_dimension` the mean of the squared error over the
+    claimed variance, 1 if the claim is exact. Standard errors are from the scatter between runs; NaN without finite
+    runs.
     """
 
     setting: int
@@ -35,7 +36,7 @@ class Detail:
 
 
 def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]) -> list[Detail]:
-    """Every state of every filter in these settings: over all steps, then at each of these."""
+    """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
     group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
     results: list[Detail] = []
@@ -51,10 +52,7 @@ def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Seq
 def _sums(
     group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Finite runs (node, filter); sums over them of squared error, claimed variance and their ratio, and of squares.
-
-    Shapes: sums (3, 1 + step, node, filter, state), over all steps in place 0; squares alike.
-    """
+    """Count finite runs (node, filter); sum squared errors, claimed variances and their ratios, and the squares."""
     error, variance = (np.asarray(group[name][setting, runs]) for name in ("error", "variance"))  # type: ignore[index]
     squared = error**2
     claimed = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
@@ -72,6 +70,7 @@ def _described(
     count, first, second = sums
     with np.errstate(divide="ignore", invalid="ignore"):
         n = count[None, None, :, :, None]
+        # Mean and its standard error over n runs: sqrt((E[x^2] - E[x]^2) / (n - 1)).
         mean = first / n
         error = np.sqrt(np.maximum(second / n - mean**2, 0.0) / (n - 1))
         rmse, claimed = np.sqrt(mean[:2])

@@ -1,7 +1,7 @@
-"""Where jobs are done: in this process, in worker processes of this machine, or on a Dask cluster.
+"""Engines that do the jobs of a campaign: in this process, in worker processes, or on a Dask cluster.
 
-An engine is a context that gives a function from jobs to (job, reply) in any order. A job whose worker dies has a reply
-too, or is done by another worker.
+An engine is a context that provides a function from jobs to (job, reply) in any order. A job whose worker dies has a
+reply too, or is done by another worker.
 """
 
 import json
@@ -36,10 +36,7 @@ Untyped = Any  # what dask.distributed gives
 def start_engine(
     campaign: str, store: Path, workers: int, scheduler: str | None = None, timeout: float = math.inf
 ) -> AbstractContextManager[Engine]:
-    """The engine on the cluster of a scheduler; else with so many worker processes; else, for none, in this process.
-
-    A job that takes longer than `timeout` seconds is given up, but for one in this process.
-    """
+    """Start the engine on the cluster of a scheduler; else with `workers` processes; for 0, in this process."""
     if scheduler is not None:
         return on_cluster(campaign, store, scheduler, timeout)
     return in_processes(campaign, store, workers, timeout) if workers else in_this_process(campaign, store)
@@ -47,13 +44,13 @@ def start_engine(
 
 @contextmanager
 def in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
-    """One job after another, here."""
+    """Do one job after another in this process."""
     yield lambda jobs: ((job, perform(campaign, str(store), job.setting, job.chunk)) for job in jobs)
 
 
 @contextmanager
 def in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
-    """As many jobs at a time as there are worker processes; one that dies, or that takes too long, is replaced."""
+    """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
     crew = [_Worker(campaign, store, timeout) for _ in range(workers)]
     try:
         yield lambda jobs: _share(crew, deque(jobs))
@@ -89,7 +86,7 @@ class _Worker:
         self.stopped = False
 
     def ask(self, job: Job) -> Reply:
-        """Have a job done; a process that dies over it, or is too late, is replaced when the next job comes."""
+        """Do a job in the process; if it dies or is too late, the next job gets a new process."""
         process = self._alive()
         late = Event()
 
@@ -97,6 +94,7 @@ class _Worker:
             late.set()
             process.kill()
 
+        # A timer kills the process at the timeout; reading its answer then ends.
         guard = Timer(min(self.timeout, TIMEOUT_MAX), give_up)
         guard.daemon = True
         guard.start()
@@ -104,6 +102,7 @@ class _Worker:
         assert process.stdout is not None
         line = process.stdout.readline()
         guard.cancel()
+        # A whole line is an answer; anything else means that the process ended.
         if line.endswith("\n") and not late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()
@@ -127,7 +126,7 @@ class _Worker:
         return self.process
 
     def stop(self) -> None:
-        """End the process; a chunk that it is at leaves no trace but a partial file."""
+        """End the process; a chunk that it is computing leaves only a partial file."""
         self.stopped = True
         self._end()
 
@@ -159,9 +158,9 @@ def _ending(code: int) -> str:
 
 @contextmanager
 def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.inf) -> Iterator[Engine]:
-    """On a Dask cluster whose workers have this package and see the store's folder; it does again what a dead one had.
+    """Do jobs on a Dask cluster whose workers have this package and see the store's folder.
 
-    Jobs are given up when none came back for `timeout` seconds.
+    Dask repeats the jobs of a worker that dies. Jobs are given up when none came back for `timeout` seconds.
 
     Raises:
         ValueError: no scheduler at the address, or one that dies.
@@ -182,7 +181,7 @@ def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.i
 
 
 def _leave(client: Untyped) -> None:
-    """Say goodbye; a client that ends by itself, its scheduler gone, may object, and why it ended is told already."""
+    """Close the client; errors of a client whose scheduler is gone are ignored, since that was reported before."""
     with suppress(OSError, RuntimeError, TimeoutError):
         client.close(timeout=CONNECT)
 
@@ -196,12 +195,14 @@ def _submit(
     collect: Untyped = as_completed
     flying = collect(loop=client.loop)
     while waiting or jobs:
+        # Submit a few jobs more than the cluster has threads, so that none of them waits.
         room = max(LOOK_AHEAD * sum(_reached(client, client.nthreads).values()), 1) - len(jobs)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
             future = client.submit(perform, campaign, store, job.setting, job.chunk, pure=False)
             jobs[future] = job
             flying.add(future)
+        # Wait for any job; without one for too long, give all up.
         future = _next(client, flying, timeout)
         if future is None:
             client.cancel(list(jobs))
@@ -211,7 +212,7 @@ def _submit(
 
 
 def _next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
-    """The next job that is done; None if none is for `timeout` seconds."""
+    """Wait for the next job that is done; None after `timeout` seconds without one."""
     waited = 0.0
     while not flying.has_ready():
         if client.status != "running":

@@ -1,4 +1,4 @@
-"""A campaign's scores as one page in which states, steps, axes, settings, nodes and filters are chosen."""
+"""Interactive page of a campaign's scores, on which states, steps, axes, settings, nodes and filters are chosen."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from heliograph.report.page import Page, Points, Section
 
 EXPLORE = "explore.html"
 ROWS = 20_000  # of each table on the page: about 2 MB, which a browser still filters at once
-STEPS = 50  # at which errors over time are told
+STEPS = 50  # at which errors over time are given
 DIGITS = 6  # of a number on the page
 ALL = "all together"  # states
 NAMES = ("node", "filter", "state")
@@ -34,11 +34,14 @@ Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[Detail]]  # into
 
 
 def explore_results(results: str | Path, out: str | Path) -> Path:
-    """Write out/explore.html, one self-contained page of the campaign in the folder `results`; returns where it is.
+    """Write out/explore.html, one self-contained page of the campaign in the folder `results`; return its path.
+
+    Args:
+        results: the results folder of a campaign.
+        out: the folder for the page, made if needed.
 
     Raises:
-        ValueError: a folder without a campaign's results, or that holds no score yet.
-        ModuleNotFoundError: an extra of `sweep`, `report`, `explore` is not installed.
+        ValueError: a folder without results, or without scores.
     """
     folder, place = file_path("results folder", results), file_path("output folder", out)
     for name in (STORE, SUMMARY):
@@ -55,10 +58,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
 
 
 def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
-    """The page as HTML. Whole settings are on it, the first that have together at most ROWS rows in each table.
-
-    `look` finds single states, over all steps and at some of them; without it the page has neither.
-    """
+    """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table."""
     shown = _first(scores)
     settings = len({score.setting for score in shown})
     page = Page(
@@ -107,7 +107,7 @@ def _first(scores: Sequence[Score]) -> list[Score]:
 
 
 def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
-    """Scores over all steps, of single states too where there are several; then single states over time."""
+    """Return scores over all steps, of single states too if there are several; then of single states over time."""
     scored = [
         Detail(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
                s.nees_error, s.finite_runs)
@@ -155,7 +155,7 @@ def _columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) 
 
 
 def _axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
-    """The first number that takes several values, else the first parameter that does, else the setting."""
+    """Return the first numeric parameter with several values, else any parameter with several, else the setting."""
     several = [name for name in parameters if len(set(columns[name])) > 1]
     numbers = [name for name in several if {type(value) for value in columns[name]} <= {int, float}]
     return next(iter([*numbers, *several]), "setting")

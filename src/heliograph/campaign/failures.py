@@ -1,4 +1,4 @@
-"""What failed in a campaign, with all that is needed to run it again alone."""
+"""Failures of a campaign, with all that is needed to repeat them alone."""
 
 import json
 import shlex
@@ -15,9 +15,10 @@ FAILURES = "failures.json"
 
 @dataclass(frozen=True)
 class Failure:
-    """A chunk, or where `chunk` is None all of a setting, that failed every time.
+    """A chunk, or a whole setting where `chunk` is None, that failed every time.
 
-    runs: the first and the last. key: the campaign's seed and the numbers that are folded into its key for the setting.
+    `runs` are the first and the last; `key` is the campaign's seed and the numbers that are folded into its key for the
+    setting.
     """
 
     setting: int
@@ -29,13 +30,13 @@ class Failure:
     traceback: str
 
     def __str__(self) -> str:
-        """One line that says what failed and why."""
+        """Describe in one line what failed and why."""
         values = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"setting {self.setting} ({values}), runs {self.runs[0]} to {self.runs[1]}: {self.error}"
 
 
 class Entry(TypedDict):
-    """A failure as failures.json holds it, with the command that runs it again alone."""
+    """A failure as stored in failures.json, with the command that repeats it alone."""
 
     setting: int
     parameters: Setting
@@ -48,14 +49,14 @@ class Entry(TypedDict):
 
 
 def read_failures(out: Path) -> list[Entry]:
-    """What failures.json beside the store holds; nothing where there is none."""
+    """Read failures.json next to the store; return an empty list if there is no such file."""
     path = out / FAILURES
     entries: list[Entry] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     return entries
 
 
 def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
-    """What is to be said of a job that failed."""
+    """Describe a job that failed, from its last reply."""
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
     return Failure(
@@ -70,7 +71,7 @@ def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
 
 
 def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried: list[Job]) -> None:
-    """Write failures.json beside the store: these, and the earlier ones of what was not tried now; none, no file."""
+    """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file."""
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
@@ -86,6 +87,6 @@ def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried
 
 
 def command(campaign: Campaign, out: Path, item: Failure) -> str:
-    """The command that runs what failed again, alone and in one process."""
+    """Return the command that repeats a failure, alone and in one process."""
     words = ["heliograph", "sweep", campaign.path, "--out", str(out.absolute()), "--setting", str(item.setting)]
     return shlex.join(words if item.chunk is None else [*words, "--chunk", str(item.chunk)])

@@ -23,7 +23,7 @@ LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an ax
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of scores with that of its standard error."""
+    """A column of scores, with the column of its standard error."""
 
     label: str
     value: str
@@ -35,7 +35,7 @@ NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
 
 
 def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
-    """Figures by name: for each numeric parameter, or else by setting, RMSE and NEES."""
+    """Return figures by name: RMSE and NEES for each numeric parameter, or else by setting."""
     parameters = [name for name in campaign.parameters if _is_axis(campaign, name)][:PARAMETERS]
     figures = {}
     for quantity in (RMSE, NEES):
@@ -47,7 +47,7 @@ def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, F
 
 
 def _is_axis(campaign: Campaign, name: str) -> bool:
-    """Whether a parameter is a number that takes several values while the others stay."""
+    """Return whether a parameter is a number that takes several values while all others are constant."""
     values = parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
@@ -61,11 +61,12 @@ def _rest(setting: Setting, name: str) -> Setting:
 
 @matplotlib.rc_context(STYLE)
 def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
-    """A quantity against a parameter, a curve for each filter with two standard errors to both sides.
+    """Plot a quantity against a parameter, a curve for each filter with error bars of two standard errors.
 
-    One panel for each node and each choice of the other parameters.
+    There is one panel for each node and each choice of the other parameters.
     """
     values = parameter_values(campaign, parameter)
+    # Panels: scores with equal node and equal other parameters.
     panels: dict[str, list[Score]] = {}
     for score in scores:
         rest = _rest(campaign.settings[score.setting], parameter)
@@ -74,6 +75,7 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
     shown = dict(list(panels.items())[:PANELS])
     figure, grid = _panels(len(shown), 2.5)
     colours = _colours(scores)
+    # A curve for each filter, in order of the parameter, with +- 2 standard errors.
     for axes, (title, part) in zip(grid, shown.items(), strict=False):
         for name in dict.fromkeys(score.filter for score in part):
             local = [score for score in part if score.filter == name]
@@ -92,11 +94,12 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
 
 @matplotlib.rc_context(STYLE)
 def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
-    """A quantity for each setting, a point for each filter with two standard errors to both sides; a panel a node."""
+    """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
     nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
     settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
     figure, grid = _panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
     colours = _colours(scores)
+    # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
             local = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
@@ -108,6 +111,7 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
         axes.set_title(in_figure(node))
         if quantity is NEES:
             axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    # One scale for all panels, and one legend.
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
     _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
     grid[-1].set_xlabel(quantity.label)
@@ -152,7 +156,7 @@ def _finish(
 
 
 def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
-    """Make a shared axis logarithmic where its values spread over much."""
+    """Make a shared axis logarithmic if its values span a large ratio."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():
         axes.set_xscale("log") if axis == "x" else axes.set_yscale("log")

@@ -1,4 +1,4 @@
-"""The names that the settings of a campaign share: what the axes of its store are called."""
+"""Labels of the axes of a campaign's store, shared by its settings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Claims = dict[str, dict[str, str]]
 
 @dataclass(frozen=True)
 class Labels:
-    """Names along the axes of a campaign's store, and the longest measurement."""
+    """Names along the axes of a campaign's store, and the size of the largest measurement."""
 
     states: tuple[str, ...]
     nodes: tuple[str, ...]
@@ -21,7 +21,7 @@ class Labels:
 
 
 class Table(TypedDict):
-    """Labels as JSON can hold them."""
+    """Labels in a form that JSON can represent."""
 
     states: Sequence[str]
     nodes: Sequence[str]
@@ -30,14 +30,14 @@ class Table(TypedDict):
 
 
 class Description(TypedDict):
-    """The labels of one network, and its claims by node and filter, as JSON can hold them."""
+    """Labels of one network and its claims by node and filter, in a form that JSON can represent."""
 
     labels: Table
     claims: Claims
 
 
 def describe(network: Network) -> Description:
-    """Labels and claims of one network."""
+    """Return labels and claims of one network."""
     claims: Claims = {node: dict(filters) for node, filters in network.claims().items()}
     labels = Table(
         states=network.states,
@@ -49,16 +49,12 @@ def describe(network: Network) -> Description:
 
 
 def labels_from(table: Table) -> Labels:
-    """The labels that `describe` gave, after their way through JSON."""
+    """Restore labels from the form that `describe` returns."""
     return Labels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
 
 def join(parts: Mapping[int, Labels]) -> Labels:
-    """Labels that hold those of every setting, in order of first appearance.
-
-    Raises:
-        ValueError: settings whose plants have other states: their errors have no common axis.
-    """
+    """Return the union of the labels of all settings, in order of first appearance."""
     first, labels = next(iter(parts.items()))
     for setting, other in parts.items():
         if other.states != labels.states:

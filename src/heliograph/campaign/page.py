@@ -1,4 +1,4 @@
-"""The report of a campaign: one self-contained page."""
+"""Report of a campaign: one self-contained page."""
 
 import math
 from collections import Counter
@@ -20,16 +20,17 @@ REPORTED = 20  # failures on the page
 
 
 def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
-    """Write the page beside the store; returns where it is."""
+    """Write the report next to the store; return its path."""
     path = out / REPORT
     path.write_text(campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
     return path
 
 
 def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Entry]) -> Page:
-    """The page of a campaign with its scores and what failed."""
+    """Return the report of a campaign with its scores and failures."""
     name = Path(campaign.path).name
     there = sum({score.setting: score.runs for score in scores}.values())
+    # Failures first, so that nobody reads the results without them.
     return Page(
         kicker="Heliograph campaign",
         title=finding(scores),
@@ -48,7 +49,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
 
 
 def finding(scores: Sequence[Score]) -> str:
-    """Which filter has the least error, and how often; of a single filter, between what its error lies."""
+    """Summarise which filter has the least error, and how often; of a single filter, the range of errors."""
     cases: dict[tuple[int, str], list[Score]] = {}
     for score in scores:
         if math.isfinite(score.rmse):
@@ -79,7 +80,7 @@ def _failures(failures: Sequence[Entry]) -> Section:
 
 
 def pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
-    """Figures of a campaign's scores."""
+    """Return the figures of a campaign's scores."""
     caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
     return [
         Picture(svg(figure), f"{name} of every filter.", caption if i == 0 else "")
@@ -88,7 +89,7 @@ def pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
 
 
 def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
-    """The first rows of the table of scores, with what its columns mean."""
+    """Return the first rows of the table of scores, with an explanation of its columns."""
     rows = [[str(score.setting), *score_row(campaign, score)] for score in scores[:ROWS]]
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
     caption = (

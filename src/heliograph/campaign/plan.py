@@ -1,4 +1,4 @@
-"""What a campaign is: settings times runs, cut into chunks whose seeds depend on setting and run alone."""
+"""Plan of a campaign: settings times runs, cut into chunks whose random keys depend on setting and run alone."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ Setting = dict[str, object]  # keyword arguments of the network's function, as J
 
 @dataclass(frozen=True)
 class Chunk:
-    """Runs start..stop - 1 of one setting: what is computed, stored and retried as a whole."""
+    """Runs start..stop - 1 of one setting: what is computed, stored and repeated as a whole."""
 
     setting: int
     number: int
@@ -43,11 +43,22 @@ class Chunk:
 @readable
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign as read from its file, with the source of the network's module: all that its results depend on.
+    """A campaign as read from its file, with everything that its results depend on.
 
-    settings: the keyword arguments of the network's function, one dictionary for each setting. inputs: by name a
-    number, or one for each step. keep: "errors" or "trajectories". path: of the file. timeout: seconds that building
-    a setting, or computing a chunk, may take; no result depends on it.
+    Args:
+        text: the text of the campaign's file.
+        network: name of the function that builds the network, as in the file.
+        source: source code of the network's module.
+        path: absolute path of the file.
+        horizon: number of steps of each run.
+        runs: number of runs of each setting.
+        seed: seed of the random key.
+        chunk: number of runs that are computed and stored together.
+        keep: "errors" or "trajectories": what the store has of each run.
+        inputs: the plant's inputs by name, each a number or a list with one number for each step.
+        settings: keyword arguments of the network's function, one dictionary for each setting.
+        timeout: seconds that building a setting, or computing a chunk, may take; no result depends on it.
+        versions: versions of packages and settings of JAX that the stored bytes depend on.
     """
 
     text: str
@@ -66,58 +77,57 @@ class Campaign:
 
     @property
     def parameters(self) -> list[str]:
-        """Names of the settings' parameters, in order of first appearance."""
+        """Return the names of the settings' parameters, in order of first appearance."""
         return list(dict.fromkeys(name for setting in self.settings for name in setting))
 
     def chunks(self, setting: int) -> list[Chunk]:
-        """The chunks of one setting."""
+        """Return the chunks of one setting."""
         starts = range(0, self.runs, self.chunk)
         return [Chunk(setting, i, start, min(start + self.chunk, self.runs)) for i, start in enumerate(starts)]
 
     def all_chunks(self) -> Iterator[Chunk]:
-        """Every chunk, setting by setting, so that a worker builds and compiles as seldom as can be."""
+        """Return every chunk, setting by setting, so that a worker builds and compiles as rarely as possible."""
         for setting in range(len(self.settings)):
             yield from self.chunks(setting)
 
     def words(self, setting: int) -> tuple[int, int]:
-        """The 64 bits that stand for a setting in its key: from its own values, so that others may come and go."""
+        """Return the two 32-bit words that identify a setting in its key: a hash of its own values.
+
+        So other settings may be added or removed without a change of its runs.
+        """
         digest = hashlib.sha256(canonical(self.settings[setting]).encode()).digest()
         return int.from_bytes(digest[:4], "big"), int.from_bytes(digest[4:8], "big")
 
     def key(self, setting: int) -> jax.Array:
-        """The key with which `monte_carlo` gives the runs of one setting."""
+        """Return the random key with which `monte_carlo` simulates one setting."""
         key = seed_key(self.seed)
         for word in self.words(setting):
             key = jax.random.fold_in(key, np.uint32(word))
         return key
 
     def function(self) -> Callable[..., Network]:
-        """The function that builds the network of a setting; loaded once in a process.
-
-        Raises:
-            ValueError: Python that does not run, or no such function. One line that names the module.
-        """
+        """Return the function that builds the network of a setting; loaded once in a process."""
         file, _, name = self.network.rpartition(":")
         return _function(str(Path(self.path).parent / file), self.source, name)
 
     def as_json(self) -> str:
-        """The campaign as text for other processes."""
+        """Serialise the campaign for other processes."""
         return json.dumps(asdict(self))
 
 
 def canonical(setting: Setting) -> str:
-    """A setting as text that does not depend on the order of its keys."""
+    """Serialise a setting as text that does not depend on the order of its keys."""
     return json.dumps(setting, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 @lru_cache(maxsize=8)
 def from_json(text: str) -> Campaign:
-    """The campaign that `as_json` wrote."""
+    """Restore a campaign from the text of `as_json`."""
     return Campaign(**json.loads(text))
 
 
 def versions() -> dict[str, str]:
-    """What decides about the store's bytes beside the campaign: packages, and how JAX is told to compute."""
+    """Return what the stored bytes depend on in addition to the campaign: packages, and configuration of JAX."""
     settings = {name: str(jax.config.values[name]) for name in SETTINGS}
     return _packages() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
 

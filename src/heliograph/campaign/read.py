@@ -1,4 +1,4 @@
-"""A campaign from its TOML file; whatever is wrong in it is one line that names the key."""
+"""Reader of a campaign's TOML file; every error is one line that names the key."""
 
 import inspect
 import math
@@ -51,19 +51,21 @@ def load_campaign(path: str | Path) -> Campaign:
 
 
 def read_campaign(text: str, source: str, path: Path) -> Campaign:
-    """The campaign in the text of a file, with the source of its network's module.
+    """Parse a campaign from the text of a file, with the source of its network's module.
 
     Raises:
-        ValueError: as `load_campaign`, but for the settings that the function does not take.
+        ValueError: as `load_campaign`, except for settings that the function does not take.
     """
     name = path.name
     table = _parse(text, name)
+    # An unknown key is most likely misspelt: name the closest one.
     for key in table:
         if key not in KEYS:
             close = get_close_matches(key, KEYS, 1)
             hint = f" (closest: {close[0]!r})" if close else ""
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
     runs, horizon = _count(table, "runs", name), _count(table, "horizon", name)
+    # Each reader checks its key and raises one line.
     return Campaign(
         text=text,
         network=_network(table, name),
@@ -146,11 +148,13 @@ def _settings(table: Mapping[str, object], name: str) -> list[Setting]:
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _grid(table["grid"], name) if "grid" in table else _listed(table["settings"], name)
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
+    # Parameters become coordinates of the store: their names must be free there, their values plain.
     for i, setting in enumerate(settings):
         for key, value in setting.items():
             if not key.isidentifier() or key in taken:
                 raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
             _check_value(value, f"{name}, {key} of setting {i}")
+    # Equal settings would have equal keys, and so equal runs.
     seen: dict[str, int] = {}
     for i, setting in enumerate(settings):
         first = seen.setdefault(canonical(setting), i)
@@ -177,7 +181,7 @@ def _listed(settings: object, name: str) -> list[Setting]:
 
 
 def _check_value(value: object, name: str) -> None:
-    """Only what JSON can hold without loss."""
+    """Accept only values that JSON represents without loss."""
     if isinstance(value, dict | list):
         for item in value.values() if isinstance(value, dict) else value:
             _check_value(item, name)
@@ -186,7 +190,7 @@ def _check_value(value: object, name: str) -> None:
 
 
 def _check_arguments(campaign: Campaign, name: str) -> None:
-    """Raise before any work if the network's function does not take the settings."""
+    """Raise before any computation if the network's function does not take the settings."""
     signature = inspect.signature(campaign.function())
     for i, setting in enumerate(campaign.settings):
         try:

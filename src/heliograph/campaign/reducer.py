@@ -1,4 +1,4 @@
-"""What a campaign keeps of each run."""
+"""Reducer that keeps the errors of each run of a campaign."""
 
 from operator import itemgetter
 
@@ -15,20 +15,20 @@ from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 
 
 class Errors(AbstractReducer[dict[str, PyTree]]):
-    """Keep each run's errors, claimed variances and NEES per dimension; with `world` its truth and measurements too.
+    """Reducer to each run's errors, claimed variances and NEES per dimension; with `world` also truth and measurements.
 
-    Gives a dictionary: "estimates" by node and filter, each with error and variance (run, time, n) and
+    The result is a dictionary: "estimates" by node and filter, each with error and variance (run, time, n) and
     nees_per_dimension = e' P^-1 e / n (run, time); "truth" (run, time, n); "measurements" by node.
     """
 
     world: bool = eqx.field(static=True, default=False)
 
     def initial(self, shapes: PyTree) -> PyTree:
-        """Nothing is summed."""
+        """Return an empty carry: nothing is summed."""
         return ()
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Collect the block's errors."""
+        """Collect the errors of a block."""
         recorded = {
             part: jax.tree.map(
                 lambda estimate: _errors(batch["truth"], estimate),
@@ -42,13 +42,13 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         return carry, recorded
 
     def of_step(self, step: PyTree) -> OfStep:
-        """The same of a block of one run and one step."""
+        """Collect the errors of a block of one run and one step."""
         block = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None, None], step)
         _, recorded = self.reduce((), block, jnp.zeros(1), jnp.ones(1, dtype=bool))
         return OfStep(collected=jax.tree.map(lambda leaf: leaf[0, 0], recorded))
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
-        """What was collected, by name."""
+        """Arrange the collected errors by node and filter."""
         results = {
             part: by_name(network, collected, itemgetter(part), axis)
             for part, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))

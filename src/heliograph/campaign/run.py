@@ -1,4 +1,4 @@
-"""Run a campaign: describe its settings, make the store, compute the chunks that it lacks, report what failed."""
+"""Run of a campaign: describe its settings, make the store, compute missing chunks, report failures."""
 
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -36,7 +36,15 @@ Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, 
 @readable
 @dataclass(frozen=True)
 class CampaignRun:
-    """What a call did: how many chunks were there, how many it computed, what failed, and which files were damaged."""
+    """Result of a call of `run_campaign`.
+
+    Attributes:
+        folder: the results folder.
+        already: number of chunks that were there before.
+        computed: number of chunks that were computed.
+        failures: chunks and settings that failed.
+        damaged: files that did not agree with their checksums.
+    """
 
     folder: Path
     already: int
@@ -55,17 +63,23 @@ def run_campaign(
 ) -> CampaignRun:
     """Compute what a campaign's results folder lacks: results.zarr, summary.csv, and failures.json if a chunk failed.
 
-    workers: processes of this machine, one for each CPU unless given; 0 computes in this process. scheduler: the
-    address of a Dask scheduler instead. only: (setting, chunk) pairs instead of all. tell(what, done, total) is called
-    as the work goes on. The store's bytes depend on the campaign alone: neither on the workers, nor on how often and
-    where it was interrupted. A chunk that fails is tried three times, then reported, one that takes longer than the
-    campaign's `timeout` at once; the rest goes on. A chunk whose files do not agree with their checksums is computed
-    again. Nothing is timed in this process, where a debugger may follow.
+    The store's bytes depend on the campaign alone: neither on the workers, nor on how often and where it was
+    interrupted. A chunk that fails is tried three times, then reported; one that takes longer than the campaign's
+    `timeout` is reported at once; the others continue. A chunk whose files do not agree with their checksums is
+    computed again. In this process there is no timeout, so that a debugger can be used.
+
+    Args:
+        campaign: the campaign, from `load_campaign`.
+        out: the results folder.
+        workers: number of worker processes, by default one for each CPU; 0 computes in this process.
+        scheduler: address of a Dask scheduler, used instead of worker processes.
+        only: (setting, chunk) pairs to compute; by default all.
+        tell: called as tell(what, done, total) to report progress.
 
     Raises:
-        ValueError: a folder of something else or of another campaign, or in which one is at work; a setting or chunk
-            that is none, no setting that can be built, settings whose plants differ in their states; no scheduler at
-            the address, or one that dies: what it has done is there.
+        ValueError: a folder of something else or of another campaign, or one in use; a setting or chunk that does not
+            exist, no setting that can be built, settings whose plants differ in their states; no scheduler at the
+            address, or one that dies, in which case finished chunks are kept.
         ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
     """
     instance("campaign", campaign, Campaign, "one from load_campaign")
@@ -89,6 +103,7 @@ def _run(
     clear_left(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     expected = _jobs(campaign, only)
+    # A store that exists must be of this campaign; damaged and partial files are removed first.
     done: set[tuple[int, ...]] = set()
     damaged: list[Path] = []
     if store.is_dir():
@@ -96,6 +111,7 @@ def _run(
         damaged = remove_damaged(store, campaign)
         remove_partial(store)
         done = done_chunks(store, campaign)
+    # Compute what is missing; the summary is removed first, since it would no longer be right.
     missing = [job for job in expected if (job.setting, job.chunk) not in done]
     already = len(expected) - len(missing)
     if not missing and not damaged and (out / SUMMARY).is_file():
@@ -107,6 +123,7 @@ def _run(
             (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
             failed = _compute(engine, campaign, store, missing, already, tell)
     remove_partial(store)
+    # Reports are written again after every call.
     failures = [failure(campaign, job, reply) for job, reply in failed.items()]
     write_failures(out, campaign, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
@@ -117,7 +134,7 @@ def _run(
 def _compute(
     engine: Engine, campaign: Campaign, store: Path, missing: Sequence[Job], already: int, tell: Tell
 ) -> dict[Job, Reply]:
-    """Describe what is not described, then compute the chunks of all that could be; returns what failed, in order."""
+    """Describe new settings, then compute the chunks of those that can be built; return failures, in order."""
     failed = _describe(engine, campaign, store, {job.setting for job in missing}, tell)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
@@ -146,8 +163,9 @@ def _count(workers: int | None, jobs: int) -> int:
 
 
 def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int], tell: Tell) -> dict[Job, Reply]:
-    """Make the store if it is not there, and write the claims it lacks; returns the settings that cannot be built."""
+    """Make the store if needed, and write missing claims; return the settings that cannot be built."""
     new = not store.is_dir()
+    # Claims are needed of a new store, of the settings to compute, and of those whose claims were damaged.
     begun = {setting for setting, _ in done_chunks(store, campaign)} if not new else set()  # its claims may be damaged
     known = set() if new else {setting for (setting,) in described(store)}
     lacking = range(len(campaign.settings)) if new else sorted((settings | begun) - known)
@@ -163,6 +181,7 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
     if new and not results:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
+    # The axes of a new store are the union of all settings; later settings must fit into them.
     labels = {setting: labels_from(results[setting]["labels"]) for setting in sorted(results)}
     if new:
         create(store, campaign, join(labels))
@@ -175,7 +194,7 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
 def _try(
     engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Description | None, int], None]
 ) -> dict[Job, Reply]:
-    """Have jobs done, accept(job, value, how many are done) the good replies; return the last of those that failed."""
+    """Do jobs, repeat failed ones, call accept(job, value, number done) for the others; return the last failures."""
     done, left = 0, {job: Reply() for job in jobs}
     hung: list[Job] = []  # what took too long once is not waited for again
     for _ in range(TRIES):

@@ -1,4 +1,4 @@
-"""A campaign on the terminal: progress with an honest estimate of the time that is left, and the table of scores."""
+"""Terminal output of a campaign: progress with an estimate of the remaining time, and the table of scores."""
 
 import math
 import sys
@@ -22,7 +22,7 @@ ROWS = 30  # of the printed table; the file has all
 
 @contextmanager
 def showing(workers: int) -> Iterator[Tell]:
-    """A progress bar on stderr; a line each minute where stderr is no terminal."""
+    """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
     countdown = Countdown(workers)
     with counting(countdown) as show:
 
@@ -37,12 +37,12 @@ def showing(workers: int) -> Iterator[Tell]:
 
 
 def score_headers(campaign: Campaign) -> list[str]:
-    """Headers of the table of scores."""
+    """Return the headers of the table of scores."""
     return [*campaign.parameters, "node", "filter", "claim", "RMSE", "±", "NEES / dim", "±", "finite runs"]
 
 
 def score_row(campaign: Campaign, score: Score) -> list[str]:
-    """A row of the table of scores: values with their standard errors."""
+    """Return a row of the table of scores: values with their standard errors."""
     setting = campaign.settings[score.setting]
     return [
         *(str(setting.get(name, "")) for name in campaign.parameters),

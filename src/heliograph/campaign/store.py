@@ -1,7 +1,7 @@
-"""The labelled Zarr store of a campaign: made whole before the first run, then filled file by file.
+"""Labelled Zarr store of a campaign: created completely before the first run, then filled file by file.
 
 Every chunk of runs has files of its own, each with a checksum, written under another name and then renamed. So a chunk
-is done when its files are there and agree with their checksums, whoever wrote them and whatever was killed meanwhile,
+is done when its files exist and agree with their checksums, whoever wrote them and whatever was interrupted meanwhile,
 and the bytes depend on the campaign alone.
 """
 
@@ -39,12 +39,12 @@ CLAIM = "claim"
 
 
 def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
-    """The variables that chunks of runs are written to, with their axes and meaning."""
+    """Return the variables that chunks of runs are written to, with their axes and meaning."""
     return ERRORS | (WORLD if campaign.keep == "trajectories" else {})
 
 
 def create(path: Path, campaign: Campaign, labels: Labels) -> None:
-    """Make the store, whole but for the claims and the chunks of runs."""
+    """Create the store, complete except for the claims and the chunks of runs."""
     with whole_folder(path) as folder:
         attributes = {
             "campaign": campaign.text,
@@ -54,13 +54,16 @@ def create(path: Path, campaign: Campaign, labels: Labels) -> None:
             "coordinates": " ".join(campaign.parameters),
         }
         group = zarr.create_group(folder, zarr_format=3, attributes=attributes)
+        # Coordinates: parameters along the settings, names along the other axes.
         coordinates = _coordinates(campaign, labels)
         for name, values in coordinates.items():
             _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
         sizes = {name: len(values) for name, values in coordinates.items()}
+        # Empty variables; a file for each chunk of runs of each setting.
         for name, (axes, meaning) in variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
             _create(group, name, axes, shape, (1, campaign.chunk, *shape[2:]), np.nan, {"long_name": meaning})
+        # The claims of a setting are one file.
         axes = ("setting", "node", "filter")
         shape = tuple(sizes[axis] for axis in axes)
         _create(group, CLAIM, axes, shape, (1, *shape[1:]), "", {"long_name": "what the filter claims of its variance"})
@@ -82,7 +85,7 @@ def _coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
 
 
 def parameter_values(campaign: Campaign, name: str) -> np.ndarray:
-    """A parameter along the settings: numbers or booleans where all values are, else text; NaN or "" if absent."""
+    """Return a parameter by setting: numbers or booleans where all values are, else text; NaN or "" if absent."""
     values = [setting.get(name) for setting in campaign.settings]
     if all(isinstance(value, bool) for value in values):
         return np.array(values)
@@ -129,7 +132,7 @@ def _create(
 
 
 def _open(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    """An array that writes a chunk's file even if nothing but fill values are in it: the file says that it is done."""
+    """Open an array that writes a chunk's file even if it has only fill values: the file marks the chunk as done."""
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array.with_config({"write_empty_chunks": True})
@@ -144,7 +147,7 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
 
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
-    """Write what the filters of one setting claim."""
+    """Write the claims of the filters of one setting."""
     labels = stored_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
     _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
@@ -158,17 +161,17 @@ def _sync(folder: Path, start: str) -> None:
 
 
 def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
-    """(setting, chunk) of the chunks whose files are all there."""
+    """Return (setting, chunk) of the chunks whose files all exist."""
     return set.intersection(*(set(_written(path / name, 2)) for name in variables(campaign)))
 
 
 def described(path: Path) -> set[tuple[int, ...]]:
-    """(setting,) of the settings whose claims are written."""
+    """Return (setting,) of the settings whose claims are written."""
     return set(_written(path / CLAIM, 1))
 
 
 def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
-    """Remove the files of chunks that do not agree with their checksums; returns which those were."""
+    """Remove the files of chunks that do not agree with their checksums; return these files."""
     files = [file for name in variables(campaign) for file in _written(path / name, 2).values()]
     damaged = [file for file in (*files, *_written(path / CLAIM, 1).values()) if not _whole(file)]
     for file in damaged:
@@ -177,19 +180,19 @@ def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
 
 
 def _whole(file: Path) -> bool:
-    """Whether the last four bytes are the checksum of all others."""
+    """Return whether the last four bytes are the checksum of all others."""
     data = file.read_bytes()
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
 def _written(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
-    """Files of chunks by the first indices of the chunk."""
+    """Return files of chunks by the first indices of the chunk."""
     files = ((name, name.split(".")[1:]) for name in os.listdir(folder) if name.startswith("c."))
     return {tuple(map(int, parts[:indices])): folder / name for name, parts in files if all(map(str.isdigit, parts))}
 
 
 def remove_partial(path: Path) -> None:
-    """Remove what a killed process left half written."""
+    """Remove the partial files of a process that was killed."""
     for folder in path.iterdir():
         for file in folder.iterdir() if folder.is_dir() else ():
             if file.name.startswith("c.") and not all(map(str.isdigit, file.name.split(".")[1:])):
@@ -197,20 +200,20 @@ def remove_partial(path: Path) -> None:
 
 
 def stored_labels(path: Path) -> Labels:
-    """The labels that the store was made for."""
+    """Return the labels that the store was created with."""
     result: Any = zarr.open_group(path, mode="r").attrs["labels"]
     return labels_from(result)
 
 
 def stored_campaign(path: Path) -> Campaign:
-    """The campaign that the store was begun with; its file is said to lie beside the store."""
+    """Return the campaign that the store was created with; its file is assumed to be next to the store."""
     attributes: Any = _attributes(path)
     stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
     return replace(stored, versions=attributes["versions"])
 
 
 def check_same(path: Path, campaign: Campaign) -> None:
-    """Raise ValueError unless the store was begun with this campaign, saying what differs."""
+    """Raise ValueError, naming the difference, unless the store was created with this campaign."""
     attributes: Any = _attributes(path)
     begun = dict(attributes["versions"])
     differs = [

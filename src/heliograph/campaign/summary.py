@@ -1,4 +1,4 @@
-"""The results of a campaign: the labelled store, and a table of RMSE and NEES by setting, node and filter."""
+"""Results of a campaign: the labelled store, and a table of RMSE and NEES by setting, node and filter."""
 
 import csv
 from dataclasses import astuple, dataclass, fields
@@ -21,12 +21,15 @@ SUMMARY = "summary.csv"
 
 
 def open_results(out: str | Path) -> "xarray.Dataset":
-    """The results of a campaign's folder as an xarray.Dataset, read when used.
+    """Open the results of a campaign as an xarray.Dataset, read when used.
 
     error and variance (setting, run, time, node, filter, state), nees_per_dimension (setting, run, time, node, filter),
-    claim (setting, node, filter); where kept truth (setting, run, time, state) and measurement (setting, run, time,
-    node, received). The parameters of the settings are coordinates along `setting`. NaN where a node lacks a filter,
-    and where chunks are missing.
+    claim (setting, node, filter); with keep = "trajectories" also truth (setting, run, time, state) and measurement
+    (setting, run, time, node, received). The parameters of the settings are coordinates along `setting`. NaN where a
+    node lacks a filter, and where chunks are missing.
+
+    Args:
+        out: the results folder.
 
     Raises:
         ValueError: a folder without results.
@@ -43,10 +46,10 @@ def open_results(out: str | Path) -> "xarray.Dataset":
 
 @dataclass(frozen=True)
 class Score:
-    """One filter of one node in one setting, over the runs that are there and finite; NaN where there are none.
+    """Scores of one filter of one node in one setting, over the finite runs; NaN where there are none.
 
-    rmse: root of the mean over runs and steps of the squared error summed over the state. nees_per_dimension: 1 if the
-    claim is exact. Standard errors are from the scatter between runs.
+    `rmse` is the root of the mean over runs and steps of the squared error summed over the state; `nees_per_dimension`
+    is 1 if the claim is exact. Standard errors are from the scatter between runs.
     """
 
     setting: int
@@ -62,7 +65,7 @@ class Score:
 
 
 def read_summary(path: Path) -> list[Score]:
-    """The scores that `write_summary` wrote."""
+    """Read the scores that `write_summary` wrote."""
     kinds = get_type_hints(Score)
     with path.open(newline="", encoding="utf-8") as file:
         rows = [{name: from_cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
@@ -70,11 +73,12 @@ def read_summary(path: Path) -> list[Score]:
 
 
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
-    """Scores of every filter; the store is read chunk by chunk."""
+    """Compute the scores of every filter; the store is read chunk by chunk."""
     group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
     scores = []
     for setting in range(len(campaign.settings)):
+        # Averages over time of each run, for the chunks that are done.
         parts = [
             _per_run(group, setting, slice(chunk.start, chunk.stop), claims[setting])
             for chunk in campaign.chunks(setting)
@@ -82,6 +86,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
         ]
         empty = np.empty((2, 0, len(labels.nodes), len(labels.filters)))
         squared, nees = np.concatenate(parts, axis=1) if parts else empty
+        # A score for each filter that the node has.
         for i, node in enumerate(labels.nodes):
             for j, name in enumerate(labels.filters):
                 if claims[setting, i, j]:
@@ -91,10 +96,7 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
 
 
 def _per_run(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
-    """Squared error summed over the state and NEES per dimension, means over time, (2, run, node, filter).
-
-    The squared error is NaN where a variance that is claimed is not finite.
-    """
+    """Return squared error summed over the state and NEES per dimension, averaged over time, (2, run, node, filter)."""
     error, variance, nees = (_read(group, name, setting, runs) for name in ("error", "variance", "nees_per_dimension"))
     squared = np.sum(error**2, axis=-1).mean(axis=1)
     squared[~np.isfinite(variance).all(axis=(1, -1)) & (claims != "none")] = np.nan
@@ -117,7 +119,7 @@ def _score(label: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarr
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
-    """Mean and its standard error."""
+    """Return the mean and its standard error."""
     if not len(values):
         return np.nan, np.nan
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan

@@ -1,4 +1,4 @@
-"""One piece of a campaign's work, as any process does it: describe a setting, or compute a chunk of its runs."""
+"""A job of a campaign, as any process does it: describe a setting, or compute a chunk of its runs."""
 
 import traceback
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ COMPILED = 16  # structures of networks whose compiled programs are kept
 
 @dataclass(frozen=True)
 class Job:
-    """What to do for one setting: compute a chunk of runs, or, without one, tell the labels and claims."""
+    """A task for one setting: compute a chunk of runs, or, without a chunk, describe labels and claims."""
 
     setting: int
     chunk: int | None = None
@@ -31,9 +31,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a job: the description of a job without a chunk, or an error in one line with its traceback.
+    """Result of a job: the description, for a job without a chunk, or an error in one line with its traceback.
 
-    late: it was given up, since it took longer than the campaign allows.
+    `late`: the job was given up, since it took longer than the campaign allows.
     """
 
     value: Description | None = None
@@ -43,7 +43,7 @@ class Reply:
 
 
 def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
-    """Do one job of a campaign given as JSON; an error becomes a reply, and the rest goes on."""
+    """Do one job of a campaign given as JSON; an error becomes a reply."""
     try:
         plan = from_json(campaign)
         _check_versions(plan)
@@ -66,6 +66,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = stored_labels(store)
     check_within(labels_from(describe(network)["labels"]), labels, chunk.setting)
+    # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,
         campaign.horizon,
@@ -81,11 +82,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
 
 
 def inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
-    """The network's inputs over the campaign's steps, (horizon, inputs).
-
-    Raises:
-        ValueError: inputs of other names than the network's.
-    """
+    """Return the network's inputs over the campaign's steps, (horizon, inputs)."""
     if sorted(campaign.inputs) != sorted(network.inputs):
         raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
     if not network.inputs:
@@ -114,7 +111,7 @@ _seen: list[Network] = []
 
 
 def _bound_memory(network: Network) -> None:
-    """Drop compiled programs once networks of more than `COMPILED` structures came by."""
+    """Drop compiled programs after networks of more than `COMPILED` structures."""
     if any(alike(network, other) for other in _seen):
         return
     if len(_seen) == COMPILED:
@@ -124,8 +121,9 @@ def _bound_memory(network: Network) -> None:
 
 
 def _arrays(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
-    """What the reducer kept on the store's axes, (run, time, ...); NaN where a node lacks a filter."""
+    """Arrange the reducer's results on the axes of the store, (run, time, ...); NaN where a node lacks a filter."""
     estimates = recorded["estimates"]
+    # Shapes are those of any filter; all have the same states.
     example = next(iter(next(iter(e for e in estimates.values() if e)).values()))
     runs, horizon = example["nees_per_dimension"].shape
     tail = (len(labels.nodes), len(labels.filters))
@@ -133,6 +131,7 @@ def _arrays(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
         name: np.full((runs, horizon, *tail, *example[name].shape[2:]), np.nan)
         for name in ("error", "variance", "nees_per_dimension")
     }
+    # Each filter goes to its place along the axes (node, filter).
     for node, filters in estimates.items():
         for name, values in filters.items():
             place = labels.nodes.index(node), labels.filters.index(name)

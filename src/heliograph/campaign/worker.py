@@ -1,7 +1,7 @@
-"""A worker process: it reads a campaign and then jobs from its standard input, a line each, and answers each in a line.
+"""Worker process: it reads a campaign and then jobs from its standard input, a line each, and answers in lines.
 
-Started as a program of its own instead of by multiprocessing: nothing is forked from under JAX, and the script that
-called the library is not run again.
+It is a program of its own instead of multiprocessing: nothing is forked while JAX runs, and the script that called the
+library is not run again.
 """
 
 import json
@@ -13,6 +13,7 @@ from dataclasses import asdict
 def main() -> None:
     """Serve until the input ends, as it does when the parent dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    # Answers go to a copy of stdout, jobs come from a copy of stdin; a user's module gets neither.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a user's module prints must not be taken for an answer
     requested = os.fdopen(os.dup(0), encoding="utf-8")
@@ -21,6 +22,7 @@ def main() -> None:
     os.close(nothing)
     from heliograph.campaign.work import perform
 
+    # One answer for each job, in order.
     campaign, store = json.loads(requested.readline())
     for line in requested:
         answer = json.dumps(asdict(perform(campaign, store, *json.loads(line))))

@@ -1,4 +1,4 @@
-"""The command `heliograph`: it reads files, calls the library and writes files. Help must not wait for JAX."""
+"""The command `heliograph`: it reads files, calls the library and writes files. Help must not import JAX."""
 
 from heliograph.cli.command import BAD_INPUT as BAD_INPUT
 from heliograph.cli.command import main as main

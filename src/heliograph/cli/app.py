@@ -1,4 +1,4 @@
-"""The app that holds the commands, and the kinds of options they take."""
+"""The application that holds the commands, and the types of their options."""
 
 import re
 from collections.abc import Sequence
@@ -17,23 +17,17 @@ app = App(
 
 
 def number(text: str) -> Parameter:
-    """An option that is a whole number."""
+    """Declare an option that is an integer."""
     return Parameter(help=text, converter=_whole)
 
 
 def place(text: str = "") -> Parameter:
-    """An option that is a file or folder."""
+    """Declare an option that is a file or folder."""
     return Parameter(help=text, converter=_path)
 
 
 def folder(command: str, out: Path | None, name: str) -> Path:
-    """The folder in which the results' own folder `name` is made, that can be written: `--out`, or what that is in.
-
-    Where `--out` already ends in `name`, the results are put there and not one deeper.
-
-    Raises:
-        ValueError: no folder given, which a command that only lists does without; one that cannot be written.
-    """
+    """Return the folder in which the results' folder `name` is made, checked to be writable: `--out` or its parent."""
     from heliograph.disk.output_file import check_output_folder
     from heliograph.numerics.check import fail
 
@@ -44,7 +38,7 @@ def folder(command: str, out: Path | None, name: str) -> Path:
 
 
 def _whole(_: type, tokens: Sequence[Token]) -> int:
-    """Digits: no fraction is rounded away."""
+    """Convert digits to an integer; fractions are refused."""
     if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
         raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
     return int(tokens[0].value)

@@ -1,4 +1,4 @@
-"""The command line as a function: from arguments to an exit code."""
+"""The command line as a function from arguments to an exit code."""
 
 import errno
 import sys
@@ -33,10 +33,7 @@ for single in COMMANDS:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
-
-    Ctrl-C ends it with INTERRUPTED and without a word, at any moment.
-    """
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
     stopped: list[int] = []
     try:
         with stoppable(stopped):
@@ -44,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception:
-        if stopped:  # what was interrupted told it in its own way
+        if stopped:  # the interrupted code has reported it
             return INTERRUPTED
         raise
     return INTERRUPTED if stopped else code
@@ -53,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _command(arguments: Sequence[str] | None) -> int:
     with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
         keep_compilations()
+    # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
         code: int | None = command(*bound.args, **bound.kwargs)
@@ -70,6 +68,7 @@ def _command(arguments: Sequence[str] | None) -> int:
         what = error.filename or ("standard output" if error.errno in FULL or _output_is_lost() else None)
         return _refuse(f"{what}: {error.strerror or error}" if what else str(error))
     except ModuleNotFoundError as error:
+        # A missing package of an extra: say how to install it.
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
@@ -77,7 +76,7 @@ def _command(arguments: Sequence[str] | None) -> int:
 
 
 def _output_is_lost() -> bool:
-    """Whether what was printed cannot be written: an error of the system does not say where it was."""
+    """Return whether standard output cannot be written: an OSError does not say where it arose."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -1,4 +1,4 @@
-"""`heliograph completion`: what makes a shell complete commands, options and files."""
+"""`heliograph completion`: script with which a shell completes commands, options and files."""
 
 from typing import Annotated, Literal
 

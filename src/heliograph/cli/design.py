@@ -1,4 +1,4 @@
-"""`heliograph design`: powers of a network, and what they are worth, as a page and a network that runs."""
+"""`heliograph design`: optimal powers of a network and their value, as a page and a network that runs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,6 +31,7 @@ def design(
     from heliograph.files.design_file import read_design
     from heliograph.report.results import write_results
 
+    # Read and check everything before the computation starts.
     target = folder("design", out, NAME) / NAME
     file = read_design(task)
 
@@ -46,7 +47,7 @@ def design(
 
 
 def stages(file: "DesignFile") -> int:
-    """Approximate number of steps that progress is shown of."""
+    """Return the approximate number of steps for the progress bar."""
     from heliograph.planning.comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)
@@ -54,15 +55,17 @@ def stages(file: "DesignFile") -> int:
 
 
 def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
-    """The design, the front about it, the worth of changes, and the map."""
+    """Compute the design, the front around it, the value of changes, and the map."""
     import heliograph as hg
     from heliograph.files.design_file import designed_source
     from heliograph.planning.comparisons import totals_about
     from heliograph.report.design_page import SOURCE, DesignResults
 
+    # The design, and the powers before it.
     advance("designing")
     best = hg.design(file.problem)
     before = hg.power(file.network, best.problem.criterion.horizon).mean
+    # Further results, each with its own progress.
     places, totals = file.map, file.front or totals_about(best.total)
     return DesignResults(
         reference=file.reference,

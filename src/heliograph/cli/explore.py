@@ -1,4 +1,4 @@
-"""`heliograph explore`: a campaign's results as a page to choose in."""
+"""`heliograph explore`: a campaign's results as an interactive page."""
 
 from pathlib import Path
 from typing import Annotated

@@ -38,11 +38,13 @@ def export(
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
 
+    # Refuse a bad place before the network is loaded.
     check_place(out)
     loaded = load_network(network)
     chosen = node_of(loaded, filter, node)
     item = loaded.nodes[chosen].filters[filter]
     names = loaded.nodes[chosen].received_names[: item.received]
+    # Write the files, then compile and time them.
     written = export_named(item, out, precision, names)
     measured = cost(written.header, written.source, item.received, len(item.inputs), PRECISIONS[precision])
     claim = claim_of(item, PRECISIONS[precision])
@@ -51,11 +53,7 @@ def export(
 
 
 def node_of(network: "Network", filter_: str, node: str | None) -> str:
-    """The node that has the filter.
-
-    Raises:
-        ValueError: no such node, or none or several that have it.
-    """
+    """Return the node that has the filter."""
     from heliograph.numerics.check import fail
 
     having = [name for name in network.names if filter_ in network.nodes[name].filters]
@@ -79,7 +77,7 @@ KINDS = {
 
 
 def costs(written: "Exported", measured: "Cost") -> list[str]:
-    """What the step costs, in two lines."""
+    """Describe the cost of a step in two lines."""
     from heliograph.export.measure import COMPILER
 
     counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}

@@ -29,7 +29,7 @@ def fit(
     seed: Annotated[int, number("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
 ) -> None:
-    """Learn the numbers that your own network marks as free by hg.free, with intervals and what cannot be told.
+    """Learn the numbers that your own network marks as free by hg.free, with intervals and identifiability.
 
     The estimates come from the earlier rows; the filters with them are judged on the later ones. Ctrl-C ends the search
     and keeps the best so far.
@@ -43,6 +43,7 @@ def fit(
     from heliograph.numerics.check import check_count, check_seed, scalar
     from heliograph.report.results import write_results
 
+    # Check the options before the work starts.
     share = float(scalar("--held-out", held_out, 0.0, 0.9))
     check_count("--starts", starts)
     check_seed("--seed", seed)
@@ -59,7 +60,7 @@ def fit(
 
 
 def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
-    """Fit to the earlier rows, judge on the later ones."""
+    """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.recording import Recording, read_recording
@@ -72,17 +73,20 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     build = NetworkAgain(network)
     start = build()
     recording = read_recording(measurements, start)
+    # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
     early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
                       recording.time[:cut])  # fmt: skip
 
+    # Progress by iterations of the search.
     def say(line: str) -> None:
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
     result = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
     judged = changes(start, result.network, recording.measurements, recording.inputs, cut) if cut < rows else []
     uniform = uniformity(result.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
@@ -93,7 +97,7 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
 
 
 def results(learned: "Learned", out: Path, network: str) -> "Results":
-    """Everything that the folder holds."""
+    """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.fit_page import fit_figures, pages
     from heliograph.report.results import Results
@@ -108,7 +112,8 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
 
 
 def _judgement(learned: "Learned") -> "dict[str, Json]":
-    """Filters before and after, and losses, as JSON has them."""
+    """Return filters before and after, and losses, for JSON."""
+    # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
     filters: list[Json] = [
         {
             "node": change.node,
@@ -122,6 +127,7 @@ def _judgement(learned: "Learned") -> "dict[str, Json]":
         }
         for change in learned.changes
     ]
+    # Each node: numbers of packets, the best law, and the shares of all laws.
     losses: dict[str, Json] = {
         name: {
             "packets": loss.packets,
@@ -139,5 +145,5 @@ def _judgement(learned: "Learned") -> "dict[str, Json]":
 
 
 def _share(share: "Share") -> "dict[str, Json]":
-    """Null where nothing was counted."""
+    """Convert a share; null if nothing was counted."""
     return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

@@ -26,20 +26,23 @@ def replay(
     trace: Annotated[Path | None, place("CSV of a recorded link, one delay a message, nan if lost.")] = None,
     seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
 ) -> None:
-    """Send a recording as messages, JSON lines on stdout for `heliograph serve`, at the pace at which it was heard."""
+    """Send a recording as messages, JSON lines on stdout for `heliograph serve`, at the pace of the recording."""
     from time import monotonic, sleep
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import TINY, check_seed, fail, scalar
     from heliograph.serving.brokers.replay import Link, along, lines, recorded, through
 
+    # Check the options; a trace replaces the model of a link.
     if speed is not None:
         scalar("--speed", speed, TINY)
     link = Link(loss, run, delay, duplicates)
     if trace is not None and link != Link():
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
+    # Events of the recording, and those that arrive through the link.
     events, origin = recorded(recording, load_network(network))
     received = through(events, link, check_seed("--seed", seed)) if trace is None else along(events, trace)
+    # Wait for each arrival on the clock, speeded up.
     begun, first = monotonic(), None
     try:
         for arrival, line in lines(received, plant, origin):

@@ -32,8 +32,8 @@ def run(
 ) -> None:
     """Run the filters of your own network over measured data.
 
-    A file of events has the columns node, sequence, time, arrival, and what was heard: in any order, late, twice. Then
-    the estimates are those that became final, and with --lag those of a lag later stand in a file beside, OUT.lagged.
+    A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
+    Then the estimates are those that became final; with --lag, those of a lag later go to a second file, OUT.lagged.
 
     Parameters
     ----------
@@ -47,6 +47,7 @@ def run(
     from heliograph.report.progress import progress
     from heliograph.smoothing.modes import named_smoothing
 
+    # Check the options before JAX is imported.
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
     later, events = named_smoothing(smooth), holds_events(measurements)
@@ -59,6 +60,7 @@ def run(
         from heliograph.files.network_file import load_network
         from heliograph.files.recording import read_recording, write_estimates
 
+        # Filter: events through a timeline, rows at once.
         loaded = load_network(network)
         if not any(node.filters for node in loaded.nodes.values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
@@ -72,6 +74,7 @@ def run(
         if out is not None:
             advance(f"writing {out}")
             write_estimates(record, out)
+    # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, record, recording, report)
     for line in (*record.failures(), *doubtful):
@@ -83,7 +86,7 @@ def run(
 def _check_requested(
     measurements: Path, out: Path | None, report: Path | None, smooths: bool, events: bool, waits: bool
 ) -> None:
-    """What goes together, and can be written, before the work starts."""
+    """Check before the work starts that the options fit together and that files can be written."""
     from heliograph.numerics.check import fail
 
     if events and (out is None or report is not None or smooths):
@@ -97,7 +100,7 @@ def _check_requested(
 def _filtered(
     network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
 ) -> tuple["Record", list[str]]:
-    """The record, and what is warned of."""
+    """Return the record, and warnings."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         record = heliograph.run(network, *recording, smooth=smooth)
@@ -105,7 +108,7 @@ def _filtered(
 
 
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
-    """What was written where, a line each."""
+    """Describe what was written where, a line for each file."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
         for node, estimates in record.estimates.items()
@@ -122,7 +125,7 @@ def _claim(estimate: "Estimate") -> str:
 
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
-    """What is written can be written, before the work starts."""
+    """Check before the work starts that files can be written."""
     from heliograph.disk.output_file import check_output
     from heliograph.numerics.check import fail
 

@@ -51,11 +51,13 @@ def serve(
     from heliograph.serving.output import schema as output_schema
     from heliograph.serving.running import ServiceSettings, run, store_of
 
+    # The schema needs no network.
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
         return
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
+    # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
     store_ = store_of(network, store, parts)

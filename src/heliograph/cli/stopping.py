@@ -1,4 +1,4 @@
-"""Signals that end a command: what it was doing unwinds, so that nothing half done stays."""
+"""Signals that end a command: the running code unwinds, so that no partial files are left."""
 
 import signal
 import sys
@@ -16,16 +16,18 @@ SOON = 0.01  # seconds
 
 @contextmanager
 def stoppable(stopped: list[int]) -> Iterator[None]:
-    """Have the signals to stop unwind what runs, so that no temporary file stays; notes each one to interrupt.
+    """Let signals to stop unwind the running code, so that no temporary file is left; record each in `stopped`.
 
-    An interrupt that comes while a compiler calls back, or while an object is removed, is swallowed there: it is
-    raised again where that is told.
+    An interrupt that arrives in a callback of the compiler, or in a destructor, is swallowed there: it is raised again
+    by a timer.
     """
 
+    # SIGINT raises KeyboardInterrupt, as usual, and is recorded.
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
         stopped.append(number)
         raise KeyboardInterrupt
 
+    # Interrupts that Python can only report are raised again a little later.
     def swallowed(what: "sys.UnraisableHookArgs") -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
             again.append(Timer(SOON, interrupt_main))  # not here: it would be swallowed once more
@@ -33,6 +35,7 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
         else:
             known(what)
 
+    # Install the handlers, and restore the previous ones at the end.
     again: list[Timer] = []
     known, terminate = sys.unraisablehook, signal.signal(signal.SIGTERM, _terminate)
     received = signal.getsignal(signal.SIGINT)

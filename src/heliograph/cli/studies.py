@@ -1,7 +1,7 @@
 """`heliograph reproduce`, `heliograph example` and `heliograph demo`: studies, also those of other packages.
 
-A package offers a study as an entry point of the group `heliograph.studies`: its name, and where it is. That is an
-object `publication` for `reproduce`, or an object `example` for `example`.
+A package offers a study as an entry point of the group `heliograph.studies`, with its name and location. The entry
+point is an object `publication` for `reproduce`, or an object `example` for `example`.
 """
 
 import ast
@@ -22,13 +22,13 @@ Changes = Annotated[
 
 
 class Study(Protocol):
-    """What an entry point leads to."""
+    """A study, as an entry point provides it."""
 
     def settings(self, values: Mapping[str, str]) -> Any:
-        """The study's own settings with other values, by name."""
+        """Return the study's settings with other values, by name."""
 
     def run(self, setting: Any, out: Path) -> Any:
-        """Compute, and write the results to the study's own folder in `out`."""
+        """Compute the study, and write the results to its own folder in `out`."""
 
 
 def demo(
@@ -104,19 +104,21 @@ def run(
 
 
 def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
-    """Values by name: those of options that are given, and of each `name=value`.
+    """Collect values by name: of options that are set, and of each `name=value`.
 
     Raises:
-        ValueError: a change without a name or `=`, a seed or count that is none, a name given twice.
+        ValueError: a change without a name or `=`, an invalid seed or count, a name set twice.
     """
     from heliograph.numerics.check import check_count, check_seed, fail
 
     values = {}
+    # Options of the command, checked as numbers.
     for name, value in options.items():
         if value is not None:
             values[name] = str(value)
             if name in ("seed", "runs"):
                 (check_seed if name == "seed" else check_count)(f"--{name}", value)
+    # Changes by --set, each name once.
     for text in changes or ():
         name, equals, value = text.partition("=")
         if not name or not equals:
@@ -128,11 +130,7 @@ def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
 
 
 def studies_of(kind: str) -> dict[str, EntryPoint]:
-    """The studies of a kind, "publication" or "example", that installed packages offer; none of them is imported.
-
-    Raises:
-        ValueError: two packages that offer a study of one name.
-    """
+    """Return the studies of a kind, "publication" or "example", of installed packages, without importing any."""
     offered: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         other = offered.setdefault(entry.name, entry).value
@@ -144,13 +142,13 @@ def studies_of(kind: str) -> dict[str, EntryPoint]:
 
 
 def load(entry: EntryPoint) -> Study:
-    """The study that an entry point leads to."""
+    """Load the study of an entry point."""
     study: Study = entry.load()
     return study
 
 
 def print_list(kind: str) -> None:
-    """Print the studies of a kind, with the first line of what each says of itself."""
+    """Print the studies of a kind, with the first line of each docstring."""
     known = studies_of(kind)
     width = max(map(len, known), default=0)
     for name, entry in known.items():
@@ -158,7 +156,7 @@ def print_list(kind: str) -> None:
 
 
 def first_line(module: str) -> str:
-    """The first line of a module's text; the module is not run."""
+    """Return the first line of a module's docstring, without running the module."""
     spec = find_spec(module)
     if spec is None or spec.origin is None:
         return ""

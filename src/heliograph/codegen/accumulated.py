@@ -1,4 +1,4 @@
-"""A compiled program over consecutive runs: some results summed over them, others given run by run."""
+"""Compiled programs over consecutive runs: some results summed over them, others returned run by run."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from heliograph.codegen.summed import Summed, row_length
 
 
 class Accumulated:
-    """Code of a program whose one argument that differs between runs is the run's number.
+    """Code of a program with one argument that differs between runs, the number of the run.
 
     `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
     """
@@ -28,12 +28,12 @@ class Accumulated:
         self.once = None if self.code.once is None else Machine(self.code.once)
 
     def begin(self, arguments: Sequence[Any]) -> "Begun":
-        """What all runs share, computed from the arguments but for the run's number."""
+        """Compute everything that the runs share, from the arguments other than the number of the run."""
         return Begun(self, arguments)
 
 
 class Begun:
-    """A program with its arguments; `shared` holds the results that all runs share, None in place of others."""
+    """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
     def __init__(self, program: Accumulated, arguments: Sequence[Any]):
         self.program = program
@@ -52,16 +52,17 @@ class Begun:
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
 
     def zeros(self) -> list[np.ndarray]:
-        """Sums over no runs, of each result that is summed: (..., batch), rows as `folded` takes them."""
+        """Return sums over no runs, of each summed result: (..., batch), rows as `folded` takes them."""
         length = row_length(self.program.width, self.program.summed.batches)
         return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
 
     def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
-        """Add runs to the sums; the other results of each, (run, ...), None in place of what is shared or summed.
+        """Add runs to the sums; return the other results, (run, ...), None for those that are shared or summed.
 
-        Runs come in blocks of consecutive ones, each as many as fit the code's width several times.
+        Runs are computed in blocks of consecutive ones, each several times the code's width.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
+        # Outputs of the code: the sums themselves, or an array with a row for each run.
         totals = iter(sums)
         results: list[np.ndarray] = []
         given: list[np.ndarray | None] = []
@@ -72,6 +73,7 @@ class Begun:
                 shape = (0,) if common else (len(numbers), *buffer.shape)
                 results.append(np.empty(shape, DTYPES[buffer.type]))
             given.append(None if summed or common else results[-1])
+        # Compute all blocks of runs.
         if len(numbers) and not all(self.program.common):
             scratch = aligned(self.program.code.scratch)
             pointers = self._pointers(numbers, results)

@@ -1,4 +1,4 @@
-"""A function of one run, compiled for many: called on arrays with a leading axis of runs, on all cores."""
+"""Functions of one run, compiled for many: called on arrays with a leading axis of runs, on all cores."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +25,7 @@ class Compiled:
     """Code for blocks of `width` runs.
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
-    it. A result is the same bits whatever the width and the number of cores.
+    it. Results have the same bits whatever the width and the number of cores.
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
@@ -39,7 +39,7 @@ class Compiled:
         self.once = None if self.code.once is None else Machine(self.code.once)
 
     def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
-        """The results of all runs, with a leading axis of runs."""
+        """Return the results of all runs, with a leading axis of runs."""
         arrays = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=True)]
         runs = next((len(x) for x, d in zip(arrays, self.differs, strict=True) if d), 1)
         code = self.code
@@ -63,7 +63,7 @@ class Compiled:
         list(threads().map(lambda start: self._blocks(pointers, start, min(start + share, blocks), runs), starts))
 
     def _blocks(self, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
-        """By this thread."""
+        """Compute blocks of runs in this thread."""
         scratch = aligned(self.code.scratch)
         self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
 
@@ -77,9 +77,9 @@ class Compiled:
 
 
 class Alone:
-    """Code for one run: memory of its own for arguments and results, which a call reads and writes in place.
+    """Code for one run with its own memory of arguments and results, which a call reads and writes in place.
 
-    `in_place` says which results, leaf by leaf, take the place of which arguments, such as a filter's state.
+    `in_place` says which results, leaf by leaf, are written over which arguments, such as a filter's state.
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
@@ -89,13 +89,13 @@ class Alone:
         self._place([])
 
     def again(self, first: Sequence[np.ndarray]) -> "Alone":
-        """The same code with memory of its own; the first arguments are these arrays, which a call only reads."""
+        """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
         new._place(first)
         return new
 
     def _place(self, first: Sequence[np.ndarray]) -> None:
-        """Memory for a call."""
+        """Allocate memory for a call."""
         kinds = self._arguments
         self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
         self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
@@ -106,46 +106,40 @@ class Alone:
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:
-        """Compute `outputs` of `inputs`."""
+        """Compute `outputs` from `inputs`."""
         run, pointers, scratch = self._call
         run(pointers, scratch, 0, 1, 1)
 
 
 def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> Compiled:
-    """Compile a function of one run's arguments, of the shapes of these, for many runs.
-
-    The arguments whose numbers stand in `shared` are the same in all runs and have no axis of runs.
-
-    Raises:
-        Unsupported: an operation that is not compiled here; the caller runs it another way.
-    """
+    """Compile a function of one run's arguments, of the shapes of these, for many runs."""
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
     return Compiled(lower(function, *examples), differs)
 
 
 def best_width() -> int:
-    """Runs of a block: one vector of the widest processors, two of others; more only spill."""
+    """Return the number of runs in a block: one vector of the widest processors, two of others; more only spill."""
     return 8
 
 
 def pointers_to(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Their addresses in memory."""
+    """Return the addresses of arrays."""
     return np.array([x.__array_interface__["data"][0] for x in arrays], dtype=np.uint64)
 
 
 def aligned(size: int) -> np.ndarray:
-    """Memory of so many bytes whose address is a multiple of a line's."""
+    """Allocate bytes at an address that is a multiple of a cache line."""
     whole = np.zeros(size + LINE, np.uint8)
     start = -whole.ctypes.data % LINE
     return whole[start : start + size]
 
 
 def cpu_count() -> int:
-    """Cores of this machine."""
+    """Return the number of cores of this machine."""
     return os.cpu_count() or 1
 
 
 @cache
 def threads() -> ThreadPoolExecutor:
-    """One for each core, of the whole process."""
+    """Return the thread pool of the process, one thread for each core."""
     return ThreadPoolExecutor(cpu_count())

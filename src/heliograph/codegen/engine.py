@@ -1,6 +1,6 @@
-"""Which engine computes a function of one run: native code where it takes the program, else XLA.
+"""Choice of the engine for a function of one run: native code where it supports the program, else XLA.
 
-The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses what it does not take, or "xla".
+The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses unsupported programs, or "xla".
 """
 
 import os
@@ -28,7 +28,7 @@ ENGINES = ("native", "xla")
 
 
 class Choice(NamedTuple):
-    """The code of a function, or why XLA computes it; `arrays` are its arguments' and those that it holds itself."""
+    """Code of a function, or the reason why XLA computes it; `arrays` are those of its arguments and of its closure."""
 
     code: Compiled | None
     why: str
@@ -41,13 +41,17 @@ class Choice(NamedTuple):
 
 
 def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Say which engine computes a function of one run over runs of these arguments, and why.
+    """Explain which engine computes a function of one run over runs of these arguments, and why.
 
-    "native: 1902 operations", or "xla: " and the operation that native code does not take, with its line. The
-    environment variable HELIOGRAPH_ENGINE forces "native" or "xla".
+    Args:
+        function: a function of the arrays of one run.
+        arguments: its arguments for several runs: trees of arrays with a leading axis of runs.
+
+    Returns:
+        "native: ..." with the number of operations, or "xla: ..." with the reason.
 
     Raises:
-        ValueError: an engine that is none.
+        ValueError: no function; HELIOGRAPH_ENGINE is "native" and the program is not supported.
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", shown(function))
@@ -56,13 +60,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 
 
 def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
-    """The code of a function of one run for arguments like these, made once; or why there is none.
-
-    Each argument differs between runs, and its arrays have a leading axis of runs, or is the same in all.
-
-    Raises:
-        ValueError: an engine that is none, or native code asked for of a program that it does not take.
-    """
+    """Return the code of a function of one run for arguments like these, compiled once; or why there is none."""
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
@@ -73,11 +71,7 @@ def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs
 
 
 def setting() -> str:
-    """The engine that is forced, "" where none is.
-
-    Raises:
-        ValueError: an engine that is none.
-    """
+    """Return the forced engine, "" if none is."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
         raise fail(SETTING, " or ".join(ENGINES), engine)
@@ -85,11 +79,7 @@ def setting() -> str:
 
 
 def attempted(make: Callable[[], Code]) -> Code | None:
-    """Native code as it is made, None where XLA is to compute instead.
-
-    Raises:
-        ValueError: an engine that is none, or native code asked for of a program that it does not take.
-    """
+    """Return native code, or None if XLA has to compute instead."""
     engine = setting()
     if engine == "xla" or _available() is not None:
         return None
@@ -103,7 +93,7 @@ def attempted(make: Callable[[], Code]) -> Code | None:
 
 @cache
 def _available() -> Choice | None:
-    """None where this machine has native code; it is said once where it has not."""
+    """Return None if this machine can run native code, else the reason, which is reported once."""
     try:
         target()
     except RuntimeError as error:
@@ -113,7 +103,8 @@ def _available() -> Choice | None:
 
 
 def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
-    """Code for the structure of a function and its arguments, which may be objects that hold arrays."""
+    """Return code for the structure of a function and its arguments, which may be objects with arrays."""
+    # Arrays become arguments; all other leaves are part of the cached key.
     leaves, form = jax.tree.flatten((function, *arguments))
     apart = [False] * len(jax.tree.leaves(function))
     apart += [d for a, d in zip(arguments, differs, strict=True) for _ in jax.tree.leaves(a)]
@@ -123,6 +114,7 @@ def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differ
         _Array(x.shape[1:] if d else x.shape, x.dtype, d) if a else x
         for x, a, d in zip(leaves, is_array, apart, strict=True)
     )
+    # A leaf without a hash has no key: XLA computes.
     try:
         code, why = _made(form, kinds)
     except TypeError as error:
@@ -133,7 +125,7 @@ def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differ
 
 
 class _Array(NamedTuple):
-    """One run's array."""
+    """Shape and type of one run's array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -142,7 +134,7 @@ class _Array(NamedTuple):
 
 @lru_cache(COMPILED)
 def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
-    """Code for one structure, and the shapes and types of its arrays."""
+    """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]
 
     def call(*values: Any) -> PyTree:

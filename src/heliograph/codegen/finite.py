@@ -1,4 +1,4 @@
-"""What a device's program may rely on: finite numbers, so that zero times them is zero, and tables however short."""
+"""Simplifications for devices: inputs are finite, so that zero times them is zero; known arrays become tables."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,10 +26,10 @@ VIEWS = frozenset(
 
 
 class FiniteGraph(Graph):
-    """A graph that also drops products of zero with what comes of `buffers` of finite numbers alone.
+    """A graph that also simplifies products of zero with numbers that depend on finite `buffers` only.
 
-    What may be missing (NaN) is no such buffer: a number made of it counts as finite only behind a choice that puts
-    another in its place.
+    A measurement, whose components may be NaN, is no such buffer: a number that depends on it counts as finite only
+    after a selection that replaces NaN.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class FiniteGraph(Graph):
         self.finite: set[Node] = set()
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """As any graph's, but for those products."""
+        """Make a node, with products of zero and a finite number simplified."""
         if op == "mul" and type == "f64":
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
@@ -50,7 +50,7 @@ class FiniteGraph(Graph):
         return made
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Numbers of tables are finite too."""
+        """Load a number; those of tables are finite too."""
         made = super().load(buffer, offset, strides, indices)
         if buffer in self.buffers:
             self.finite.add(made)
@@ -61,20 +61,20 @@ class FiniteGraph(Graph):
 
 
 class DeviceLowering(Lowering):
-    """Lowers into a `FiniteGraph`: written out, with known arrays as tables of which the step may choose a row."""
+    """Lowering into a `FiniteGraph`: written out, with known arrays as tables that a step can index."""
 
     def __init__(self) -> None:
         super().__init__()
         self.graph: FiniteGraph = FiniteGraph()
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Arithmetic is written out where the arrays that a loop would go through are not too long for that."""
+        """Lower one operation; arithmetic is written out unless its arrays are too long."""
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
             inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LARGE else x for x in inputs]
         return super().equation(equation, inputs)
 
     def known(self, number: Any) -> Value:
-        """An array of known numbers in memory; what is read of it at a known place is a constant."""
+        """Place an array of known numbers in memory; an entry at a known place is a constant."""
         if not isinstance(number, np.ndarray | np.generic | jax.Array) or not np.shape(number) or not np.size(number):
             return super().known(number)
         if isinstance(number, np.ndarray) and number.dtype == object:

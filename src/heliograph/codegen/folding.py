@@ -1,6 +1,6 @@
-"""What is known of a scalar operation before any data: numbers of numbers, neutral elements, one operation for two.
+"""Simplification of scalar operations: constants, neutral elements, two operations as one.
 
-A product with zero is zero only where the other factor is known to be finite: data may be NaN.
+A product with zero is zero only if the other factor is known to be finite: data may be NaN.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 
 
 def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
-    """A node that is there already, or a simpler one, of the same number; None where nothing is known."""
+    """Return an existing or simpler node of the same value; None if there is none."""
     if all(a.op == "constant" for a in args):
         return _evaluated(graph, op, type, args)
     rule = SIMPLER.get(op)
@@ -79,7 +79,7 @@ def _is(node: Node, number: float) -> bool:
 
 
 def is_finite(node: Node) -> bool:
-    """Whether a number is finite whatever the data."""
+    """Return whether a number is finite whatever the data."""
     if node.type != "f64" or (node.op == "constant" and math.isfinite(node.value)):
         return True
     return node.op == "convert" or (node.op == "select" and all(is_finite(a) for a in node.args[1:]))
@@ -126,7 +126,7 @@ def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
-    """By a power of two as the exact product with its reciprocal."""
+    """Replace a division by a power of two by the product with its reciprocal, which is exact."""
     if type != "f64" or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
     if abs(math.frexp(b.value)[0]) != 0.5 or not 1e-300 < abs(b.value) < 1e300:
@@ -196,7 +196,7 @@ def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node
 
 def _compare(op: str) -> Callable[..., Node | None]:
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
-        """Of a flag that was made a number, or of a flag and a known one: the flag itself; of a number and itself."""
+        """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
         if a is b and (a.type != "f64" or a in graph.numbers or is_finite(a)):
             return graph.constant(op == "eq", "bool")
         if a.op == "constant":

@@ -1,8 +1,7 @@
-"""A program of scalar operations: nodes in blocks, loops and guarded blocks between them, arrays in memory.
+"""Programs of scalar operations: nodes in blocks, with loops and guarded blocks between them, and arrays in memory.
 
-A node is one number of every run. Equal expressions are one node, known numbers are folded when a node is made
-(`folding`), and a node stands in the outermost block in which all its arguments stand: what a loop does not change is
-computed before it.
+A node is one number in every run. Equal expressions are one node, constants are folded when a node is made (`folding`),
+and a node belongs to the outermost block that has all its arguments: what a loop does not change is computed before it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +25,7 @@ Number = float | int | bool
 
 
 class Unsupported(Exception):  # noqa: N818
-    """A program that is not compiled here: which operation, and where in the program."""
+    """Error of a program that is not supported: the operation, and its place in the program."""
 
     def __init__(self, operation: str, place: str = ""):
         super().__init__(f"{operation}{f' at {place}' if place else ''}")
@@ -34,9 +33,9 @@ class Unsupported(Exception):  # noqa: N818
 
 
 class Node:
-    """One scalar operation of some nodes.
+    """One scalar operation on some nodes.
 
-    `value` is what is known of it beforehand: a constant's number, a parameter's or result's (loop, place), a load's
+    `value` has what is known at compile time: a constant's number, a parameter's or result's (loop, place), a load's
     (buffer, offset, strides). `serial` counts nodes in the order in which they were made.
     """
 
@@ -61,10 +60,10 @@ class Key:
 
 
 class Block:
-    """Operations and statements in their order; nodes of the blocks around it may be used in it.
+    """Operations and statements in order; they may use nodes of the enclosing blocks.
 
-    `owner`: the loop or guard whose block it is. `pinned`: what is computed here stays here, since it is computed only
-    where a run needs it.
+    `owner`: the loop or guard of the block. `pinned`: nodes made here stay here, since they are computed only where a
+    run needs them.
     """
 
     __slots__ = ("depth", "items", "owner", "parent", "pinned", "seen")
@@ -77,7 +76,7 @@ class Block:
         self.seen: dict[Any, Node] = {}
 
     def inwards(self) -> Iterator["Block"]:
-        """This block and those around it, outermost last."""
+        """Yield this block and the enclosing ones, outermost last."""
         block: Block | None = self
         while block is not None:
             yield block
@@ -85,10 +84,10 @@ class Block:
 
 
 class Buffer:
-    """Numbers in memory, `size` of each run; a known table has the same ones in all runs.
+    """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
 
-    `kind`: "input", "scratch" or "table". A buffer that the program itself fills is read after the statement of `block`
-    that fills it. One that lies `inside` another starts at a place of it.
+    `kind`: "input", "scratch" or "table". A buffer that the program fills is read after the statement of `block` that
+    fills it. A buffer `inside` another starts at a place of it.
     """
 
     __slots__ = ("block", "inside", "kind", "parts", "shape", "stores", "table", "type")
@@ -100,13 +99,13 @@ class Buffer:
         self.parts: list[Buffer] = []
 
     def take_in(self, part: "Buffer", start: int) -> None:
-        """Have another buffer lie in this one from a place on."""
+        """Place another buffer inside this one, from an offset on."""
         part.inside = self, start
         self.parts.append(part)
 
     @property
     def owner(self) -> "tuple[Buffer, int]":
-        """The buffer whose memory this one is, and where in it this one starts."""
+        """Return the buffer whose memory this one uses, and the offset in it."""
         if self.inside is None:
             return self, 0
         whole, start = self.inside[0].owner
@@ -114,7 +113,7 @@ class Buffer:
 
     @property
     def size(self) -> int:
-        """Numbers of one run."""
+        """Return the count of numbers of one run."""
         return int(np.prod(self.shape, dtype=int))
 
 
@@ -133,8 +132,8 @@ class Store:
 class Loop:
     """A body that is repeated: `length` times, or while any run's condition holds (then `length` is None).
 
-    `parameters` stand for what is carried, `initial` and `following` for its numbers before and after a turn,
-    `results` for those after the last one. `counter` counts the turns from 0. `block` is where the loop stands.
+    `parameters` stand for the carry in the body, `initial` and `following` for the carry before and after a turn,
+    `results` for the carry after the last one. `counter` counts the turns from 0. `block` is the enclosing block.
     """
 
     __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
@@ -151,7 +150,7 @@ class Loop:
 
 
 class Check:
-    """The place in a loop's body where it ends unless some run's condition holds."""
+    """Exit of a loop, at this place of its body, unless some run's condition holds."""
 
     __slots__ = ("loop",)
 
@@ -160,7 +159,7 @@ class Check:
 
 
 class Guard:
-    """A body that is computed only where `condition` holds for some run; `results` are its `values`, else zeros."""
+    """A body that is computed only if `condition` holds for some run; `results` are its `values`, else zeros."""
 
     __slots__ = ("block", "body", "condition", "results", "values")
 
@@ -173,7 +172,7 @@ class Guard:
 
 
 class Graph:
-    """A program under construction. Nodes are made in `current`, the innermost block that is open."""
+    """A program under construction. Nodes are made in `current`, the innermost open block."""
 
     def __init__(self) -> None:
         self.top = Block(None)
@@ -182,7 +181,7 @@ class Graph:
         self.numbers: set[Node] = set()  # known not to be NaN
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """The node of an operation: a known number, an older node that says the same, or a new one."""
+        """Return a node of an operation: a constant, an existing equal node, or a new one."""
         simpler = folded(self, op, type, args)
         if simpler is not None:
             return simpler
@@ -191,7 +190,7 @@ class Graph:
         return self.unfolded(op, type, args, value)
 
     def unfolded(self, op: str, type: Type, args: tuple[Node, ...], value: Any = None) -> Node:
-        """The same as written."""
+        """Make a node without simplification."""
         key = (op, type, args, value)
         for block in self.current.inwards():
             if key in block.seen:
@@ -202,7 +201,7 @@ class Graph:
         return made
 
     def constant(self, value: Number, type: Type) -> Node:
-        """A known number."""
+        """Make a constant."""
         key = (type, value if value != 0 or type != "f64" else str(value))  # two zeros
         known = self.top.seen.get(key)
         if known is None:
@@ -210,14 +209,14 @@ class Graph:
         return known
 
     def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
-        """A node that equals no other, in no block's list yet."""
+        """Make a node that equals no other, and that no block contains yet."""
         self.serial += 1
         if self.serial > MOST:
             raise Unsupported(f"a program of more than {MOST} operations")
         return Node(op, type, args, block, value, self.serial)
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """buffer[offset + sum strides * indices], read where the buffer is full."""
+        """Load buffer[offset + sum strides * indices], after the buffer is filled."""
         pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
         if buffer.table is not None and not pairs:
@@ -234,13 +233,13 @@ class Graph:
         return made
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
-        """Have the open block write a number."""
+        """Store a number, in the open block."""
         written = Store(self.current, buffer, node, offset, strides, indices)
         buffer.stores.append(written)
         self.current.items.append(written)
 
     def _place(self, *depths: int) -> Block:
-        """The outermost block, from the open one on, of a depth, unless a pinned one comes before."""
+        """Return the outermost block of at least this depth, within the innermost pinned one."""
         place, depth = self.current, max(depths)
         while place.depth > depth and not place.pinned and place.parent is not None:
             place = place.parent

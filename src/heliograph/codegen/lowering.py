@@ -1,8 +1,7 @@
-"""From a traced function of one run to a graph of scalar operations.
+"""Lowering of a traced function of one run to a graph of scalar operations.
 
-An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations move
-references and cost nothing; or, where it is long, `InMemory`. What becomes of each operation of JAX stands in `RULES`,
-which the files of rules fill when they are imported.
+An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations only move
+references; or, if it is long, `InMemory`. `RULES` has a rule for each operation of JAX, from the files of rules.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -24,14 +23,14 @@ IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in me
 
 
 class Lowering:
-    """Lowers operations one after another into a graph."""
+    """Lowering of operations one after another into a graph."""
 
     def __init__(self) -> None:
         self.graph = Graph()
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
-        """The results of a traced program for these arguments."""
+        """Return the results of a traced program for these arguments."""
         jaxpr: Any = program
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
@@ -45,7 +44,7 @@ class Lowering:
         return [self._read(values, v) for v in jaxpr.outvars]
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """The results of one operation."""
+        """Return the results of one operation."""
         name = equation.primitive.name
         try:
             if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
@@ -57,11 +56,11 @@ class Lowering:
             raise (error if error.place else Unsupported(error.operation, place(equation))) from None
 
     def nodes(self, value: Value) -> np.ndarray:
-        """A value as a NumPy array of nodes."""
+        """Return a value as a NumPy array of nodes."""
         return value.nodes(self.graph) if isinstance(value, InMemory) else value
 
     def scalar(self, value: Value) -> Node:
-        """A value of no axes as its node."""
+        """Return the node of a value without axes."""
         nodes = self.nodes(value)
         if nodes.size != 1:
             raise Unsupported("a condition for each entry of an array")
@@ -69,7 +68,7 @@ class Lowering:
         return node
 
     def known(self, number: Any) -> Value:
-        """An array of known numbers: as constants, or as a table in memory where it is long."""
+        """Return an array of known numbers: as constants, or as a table in memory if it is long."""
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
@@ -85,7 +84,7 @@ class Lowering:
 
 
 def _check_shapes(equation: JaxprEqn, results: Sequence[Value]) -> None:
-    """What a rule gives has the shapes that the trace says: a rule that is wrong is found where it is."""
+    """Raise unless a rule's results have the shapes of the trace, so that a wrong rule is found where it is."""
     for variable, value in zip(equation.outvars, results, strict=True):
         aval: Any = variable.aval
         if value.shape != aval.shape:
@@ -93,7 +92,7 @@ def _check_shapes(equation: JaxprEqn, results: Sequence[Value]) -> None:
 
 
 def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Nodes in row-major order as an array."""
+    """Arrange nodes in row-major order as an array."""
     flat = list(nodes)
     result = np.empty(len(flat), dtype=object)
     result[:] = flat
@@ -101,13 +100,13 @@ def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def keys_of(words: np.ndarray) -> np.ndarray:
-    """Keys (...) of their words (..., 2)."""
+    """Return keys (...) from their words (..., 2)."""
     flat = words.reshape(-1, 2)
     return array_of((Key(*pair) for pair in flat), words.shape[:-1])
 
 
 def type_of(value: Any) -> Type:
-    """The type of a number, or of an array's numbers."""
+    """Return the type of a number, or of an array's numbers."""
     name = np.dtype(value.dtype).name
     if name not in TYPES:
         raise Unsupported(f"numbers of type {name}")
@@ -115,23 +114,23 @@ def type_of(value: Any) -> Type:
 
 
 def result_type(equation: JaxprEqn, place: int = 0) -> Type:
-    """The type of an operation's result."""
+    """Return the type of an operation's result."""
     return type_of(equation.outvars[place].aval)
 
 
 def result_shape(equation: JaxprEqn, place: int = 0) -> tuple[int, ...]:
-    """The shape of an operation's result."""
+    """Return the shape of an operation's result."""
     aval: Any = equation.outvars[place].aval
     return tuple(aval.shape)
 
 
 def like(shape: Sequence[int], dtype: Any) -> Any:
-    """What JAX traces an array of this shape and type from."""
+    """Return a placeholder from which JAX traces an array of this shape and type."""
     return jax.ShapeDtypeStruct(tuple(shape), dtype)  # type: ignore[no-untyped-call]
 
 
 def known_integers(value: np.ndarray) -> np.ndarray | None:
-    """An array of known integers, None where data decide one of them."""
+    """Return an array of known integers, None if one of them depends on data."""
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
@@ -139,7 +138,7 @@ def known_integers(value: np.ndarray) -> np.ndarray | None:
 
 
 def place(equation: JaxprEqn) -> str:
-    """The line of a user's or the library's code that an operation comes from."""
+    """Return the line of a user's or the library's code that an operation comes from."""
     traceback = equation.source_info.traceback
     frames: list[Any] = [] if traceback is None else traceback.frames
     inside = ("/jax/", "/equinox/", "/heliograph/codegen/")
@@ -148,7 +147,7 @@ def place(equation: JaxprEqn) -> str:
 
 
 def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJaxpr, Any]:
-    """A function of one run as a program of JAX in double precision, and the structure of its result."""
+    """Trace a function of one run in double precision; return its program and the structure of its result."""
     with jax.enable_x64(True):
         flat, tree = jax.tree.flatten(examples)
         program, shape = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True)(

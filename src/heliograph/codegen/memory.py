@@ -12,7 +12,7 @@ LARGE = 4096  # numbers: an array in memory that is longer is not loaded whole
 
 
 class InMemory:
-    """shape, and where entry (i, j, ...) lies: offset + sum strides * (i, j, ...) + sum of moves, (stride, node)."""
+    """Array with entry (i, j, ...) at offset + sum strides * (i, j, ...) + sum of moves, pairs (stride, node)."""
 
     __slots__ = ("buffer", "loaded", "moves", "offset", "shape", "strides")
 
@@ -29,39 +29,39 @@ class InMemory:
 
     @classmethod
     def whole(cls, buffer: Buffer) -> "InMemory":
-        """All of a buffer."""
+        """Return the view of a whole buffer."""
         return cls(buffer, buffer.shape, contiguous(buffer.shape))
 
     @property
     def ndim(self) -> int:
-        """Number of axes."""
+        """Return the number of axes."""
         return len(self.shape)
 
     @property
     def size(self) -> int:
-        """Number of entries."""
+        """Return the number of entries."""
         return int(np.prod(self.shape, dtype=int))
 
     @property
     def type(self) -> Type:
-        """Of its numbers."""
+        """Return the type of its numbers."""
         return self.buffer.type
 
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "InMemory":
-        """Another view of the same memory, from so much further on."""
+        """Return another view of the same memory, at a further offset."""
         return InMemory(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "InMemory":
-        """Entry `index` along the first axis."""
+        """Return entry `index` along the first axis."""
         if isinstance(index, int) or index.op == "constant":
             known = index if isinstance(index, int) else int(index.value)
             return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
         return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
 
     def nodes(self, graph: Graph) -> np.ndarray:
-        """All of its numbers, loaded."""
+        """Load all numbers."""
         if self.loaded is None or self.loaded[0] not in graph.current.inwards():
             if self.size > LARGE:
                 raise Unsupported(f"an array of {self.size} numbers at once")
@@ -77,11 +77,12 @@ class InMemory:
         return result
 
     def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
-        """The same numbers in another shape, None where they do not lie so."""
+        """Return the same numbers in another shape, None if no strides describe it."""
         if not self.size:
             return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
         strides: list[int] = []
+        # New axes are split off old ones, from the last on; old axes that lie contiguously are merged.
         place, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on
         base = 1
         for n in reversed(shape):
@@ -99,6 +100,7 @@ class InMemory:
             while left < n and place >= 0 and axes[place][1] == base * left:
                 left *= axes[place][0]
                 place -= 1
+            # The new axis does not divide what is left.
             if left % n:
                 return None
             strides.append(base)
@@ -107,6 +109,6 @@ class InMemory:
 
 
 def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
-    """Strides of an array whose last axis is innermost."""
+    """Return the strides of an array whose last axis is innermost."""
     strides = np.cumprod([1, *shape[:0:-1]])[::-1]
     return tuple(int(s) for s in strides[: len(shape)])

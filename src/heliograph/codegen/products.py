@@ -1,4 +1,4 @@
-"""Products that are computed with the sum that uses them, in one rounding."""
+"""Fusion of products with the sums that use them, in one rounding."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,7 +7,7 @@ from heliograph.codegen.graph import Guard, Loop, Node, Store
 
 
 def fusable(node: Node, products: set[Node]) -> Node | None:
-    """The product that is computed with a sum or difference as one operation."""
+    """Return the product that is computed with a sum or difference as one operation."""
     if node.op not in ("add", "sub") or node.type != "f64":
         return None
     results = [a for a in node.args if a in products and a.value is node]
@@ -15,7 +15,7 @@ def fusable(node: Node, products: set[Node]) -> Node | None:
 
 
 def products_of(items: Iterable[Any]) -> set[Node]:
-    """Products that are used once, by a sum or difference: marks each with its user, of two the later one."""
+    """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
     users: dict[Node, list[Any]] = {}
     for item in items:
         for used in uses(item):
@@ -33,7 +33,7 @@ def products_of(items: Iterable[Any]) -> set[Node]:
 
 
 def uses(item: Any) -> list[Node]:
-    """The nodes that an item of a program uses itself."""
+    """Return the nodes that an item of a program uses directly."""
     if isinstance(item, Node):
         return list(item.args)
     if isinstance(item, Store):

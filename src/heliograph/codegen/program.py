@@ -1,4 +1,4 @@
-"""A lowered program: its inputs and outputs, and which nodes and statements these need."""
+"""Lowered programs: inputs and outputs, and the nodes and statements that these need."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -40,16 +40,12 @@ class Program(NamedTuple):
 
 
 def lower(function: Callable[..., PyTree], *examples: PyTree) -> Program:
-    """A function of one run as a graph, for arguments of these shapes.
-
-    Raises:
-        Unsupported: an operation that is not lowered.
-    """
+    """Lower a function of one run, for arguments of these shapes."""
     return lower_traced(*traced(function, *examples))
 
 
 def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
-    """The same of a program that is traced already."""
+    """Lower a program that is traced already."""
     lowering = Lowering()
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
@@ -66,7 +62,7 @@ def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
 
 
 def scalars(value: Value) -> list[Node]:
-    """The nodes of an array, in row-major order, a key as its two words."""
+    """Return the nodes of an array, in row-major order, a key as its two words."""
     flat: list[Any] = value.ravel().tolist()
     return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
 
@@ -98,6 +94,7 @@ def _arguments(item: Any) -> list[Any]:
         return [item.condition]
     if isinstance(item, Loop):
         return [] if item.condition is None else [item.condition]
+    # Nodes: a load needs its buffer, a result of a loop the loop and the carry.
     if item.op == "load":
         return [*item.args, item.value[0]]
     if item.op in ("parameter", "result"):

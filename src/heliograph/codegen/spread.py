@@ -1,4 +1,4 @@
-"""Which numbers of a program differ between runs: the others are computed once for all."""
+"""Analysis of which numbers of a program differ between runs; all others are computed once."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,10 +8,7 @@ from heliograph.codegen.program import needed
 
 
 def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any]:
-    """Nodes, buffers, loops and guards that differ between runs where these input buffers do.
-
-    A loop that ends for each run at its own turn, and a block computed for runs that need it, differ in all they do.
-    """
+    """Return nodes, buffers, loops and guards that differ between runs if these input buffers do."""
     results: set[Any] = set(inputs)
     items = sorted(needed(roots), key=_order)
     count = -1
@@ -31,6 +28,7 @@ def _varies(item: Any, result: set[Any]) -> bool:
         if owner is not item:
             return owner in result
         return any(store.node in result or _is_apart(store.block, result) for store in _stores(item))
+    # Statements: a loop differs by its condition, a store makes its buffer differ.
     if isinstance(item, Loop):
         return item.length is None and (item.condition in result or any(p in result for p in item.parameters))
     if isinstance(item, Guard):
@@ -40,6 +38,7 @@ def _varies(item: Any, result: set[Any]) -> bool:
             result.add(item.buffer.owner[0])
             return True
         return False
+    # Nodes: by their block, by memory, by the carry, else by their arguments.
     if item.op in ("constant", "counter"):
         return False
     if _is_apart(item.block, result):
@@ -60,5 +59,5 @@ def _stores(buffer: Buffer) -> list[Store]:
 
 
 def _is_apart(block: Block, result: set[Any]) -> bool:
-    """Whether a block lies in a loop or guard that differs between runs."""
+    """Return whether a block lies in a loop or guard that differs between runs."""
     return any(b.owner in result for b in block.inwards() if b.owner is not None)

@@ -1,7 +1,7 @@
 """Results that a block of runs adds to sums over runs [entry][batch].
 
-Run r goes to batch r mod BATCHES. A row of sums is W - 1 longer than there are batches, so that the W consecutive runs
-of a block never turn back to its beginning; what stands beyond its end is added to its beginning at last (`folded`).
+Run r belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, so that W consecutive
+runs of a block never wrap around; what is beyond the end is added to the beginning at last (`folded`).
 """
 
 from typing import NamedTuple
@@ -18,12 +18,12 @@ class Summed(NamedTuple):
 
 
 def row_length(width: int, batches: int) -> int:
-    """Numbers of a row of sums."""
+    """Return the length of a row of sums."""
     return batches + width - 1
 
 
 def folded(sums: np.ndarray, batches: int) -> np.ndarray:
-    """Sums (..., batch) of rows (..., `row_length`)."""
+    """Return sums (..., batch) from rows (..., `row_length`)."""
     result = sums[..., :batches].copy()
     beyond = sums[..., batches:]
     result[..., : beyond.shape[-1]] += beyond

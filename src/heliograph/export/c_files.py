@@ -1,4 +1,4 @@
-"""A filter as two files of C99."""
+"""Export of a filter as two files of C99."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ RESERVED = frozenset((
 
 
 class Exported(NamedTuple):
-    """The files, how often each operation stands in a step, and bytes of the state."""
+    """Result of an export: the files, the number of each operation in a step, and bytes of the state."""
 
     header: Path
     source: Path
@@ -35,30 +35,33 @@ class Exported(NamedTuple):
 def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double") -> Exported:
     """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
 
-    `step_start(state)` begins; `step_step(state, z, u)` predicts over one step with the inputs u and uses what arrived
-    of z (NaN: did not arrive), and returns 0, or refuses by another number and leaves the state as it was;
-    `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. No heap, no variables of the file, no
-    library but libm. All names begin with the name of the file.
+    `step_start(state)` initialises; `step_step(state, z, u)` predicts over one step with the inputs u and corrects by
+    the components of z that arrived (NaN: did not arrive), and returns 0, or refuses by another number and leaves the
+    state unchanged; `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. There is no heap, no
+    global variable, and no library but libm. All names begin with the name of the file. A filter of a plant that varies
+    over time contains its tables, and refuses a step past their end.
 
-    `precision`: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as
-    L D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains. The filter
-    of a plant that varies over time holds its tables, and refuses a step past their end.
+    Args:
+        filter: the filter.
+        path: path of the source, which ends in .c; the header is written next to it.
+        precision: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as L
+            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains.
+
+    Returns:
+        The two files, the number of each operation in a step, and the bytes of the state.
 
     Raises:
         ValueError: no filter; a path that does not end in .c, is no name in C or cannot be written; random numbers, or
-            operations that C has not, with the line they come from; single precision of another filter. Then nothing
-            is written.
+            operations that C does not have, with the line they come from; single precision of another filter. Then
+            nothing is written.
+
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), for single precision.
     """
     return export_named(filter, path, precision, None)
 
 
 def export_named(filter_: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
-    """`export_c` with names for the components of z, z0, z1, ... or the sensor's where none are given.
-
-    Raises:
-        ValueError: what `export_c` refuses.
-    """
+    """Write as `export_c`, with names for the components of z; without names the sensor's, or z0, z1, ..."""
     item: AbstractFilter = instance("export", filter_, AbstractFilter, "a filter")
     source = check_place(path)
     if precision not in PRECISIONS:
@@ -72,11 +75,7 @@ def export_named(filter_: object, path: str | Path, precision: str, received: Se
 
 
 def check_place(path: str | Path) -> Path:
-    """The path of the source, whose name begins the names in it.
-
-    Raises:
-        ValueError: a path that does not end in .c, is no name in C or cannot be written.
-    """
+    """Check the path of the source, whose name is the prefix of the names in it."""
     if not isinstance(path, str | Path):
         raise fail("path of the source", "a file that ends in .c", shown(path))
     source = Path(path)
@@ -89,11 +88,7 @@ def check_place(path: str | Path) -> Path:
 
 
 def text_of(item: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
-    """Both files of a filter.
-
-    Raises:
-        ValueError: random numbers, operations that C has not, single precision of a filter that has no such form.
-    """
+    """Return the text of both files of a filter."""
     names = received_names(item) if received is None else received
     kind = f"a {type(item).__name__} in {'double' if real == 'double' else 'single'} precision"
     if real == "float" and not isinstance(item, ScheduledFilter):  # whose covariances are a table
@@ -102,6 +97,6 @@ def text_of(item: AbstractFilter, prefix: str, real: Real, received: Sequence[st
 
 
 def received_names(item: AbstractFilter) -> Sequence[str]:
-    """The sensor's outputs where the filter has a sensor and as many arrive, else z0, z1, ..."""
+    """Return the sensor's outputs if the filter has a sensor and as many arrive, else z0, z1, ..."""
     outputs: tuple[str, ...] = first(item.sensor).outputs if hasattr(item, "sensor") else ()
     return outputs if len(outputs) == item.received else [f"z{i}" for i in range(item.received)]

@@ -1,4 +1,4 @@
-"""What an exported step costs: bytes and nanoseconds on this machine, where it has a C compiler."""
+"""Cost of an exported step: bytes and nanoseconds on this machine, if it has a C compiler."""
 
 import re
 import shutil
@@ -16,14 +16,14 @@ REPEATS = 5
 
 
 class Cost(NamedTuple):
-    """Bytes of code and constants, and nanoseconds of a step, the fastest of five rounds; None where not measured."""
+    """Bytes of code and constants, and nanoseconds of a step, the fastest of five rounds; None if not measured."""
 
     code_bytes: int | None
     nanoseconds: float | None
 
 
 def cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
-    """Compile and time a step, in a folder of its own."""
+    """Compile and time a step, in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
         return Cost(None, None)
@@ -39,7 +39,7 @@ def cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> 
 
 
 def _code_bytes(folder: Path) -> int | None:
-    """Text and constants of the object file, without what only a debugger reads."""
+    """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None
     sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", _run("size", "-A", "step.o", folder=folder), re.MULTILINE)
@@ -51,7 +51,7 @@ def _run(*command: str, folder: Path) -> str:
 
 
 def _timer(name: str, received: int, inputs: int, real: Real) -> str:
-    """A program that prints the time of a step. What is refused (the end of a horizon) begins anew."""
+    """Return a program that prints the time of a step. After a refusal (the end of a horizon) it starts again."""
     return f"""#include <stdio.h>
 #include <time.h>
 #include "{name}.h"

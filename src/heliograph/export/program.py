@@ -19,7 +19,7 @@ RANDOM = ("random_", "threefry")
 
 
 class Leaf(NamedTuple):
-    """An array of the state: its name, its buffer, its numbers at the start and the nodes after a step."""
+    """An array of the state: its name, its buffer, its initial numbers and the nodes after a step."""
 
     name: str
     buffer: Buffer
@@ -28,7 +28,7 @@ class Leaf(NamedTuple):
 
 
 class StepProgram(NamedTuple):
-    """A step: what it reads, what it makes; `mean` and `covariance` also before the first step."""
+    """A step: its inputs and outputs; `start_mean` and `start_covariance` are those before the first step."""
 
     filter: AbstractFilter
     graph: FiniteGraph
@@ -44,13 +44,13 @@ class StepProgram(NamedTuple):
 
 
 def step_program(item: AbstractFilter) -> StepProgram:
-    """Lower `step` of a filter.
+    """Lower `step` of a filter to a graph of scalar operations.
 
-    An array of the state that is symmetric at the start, and after every step that began with a symmetric one, is
-    symmetric always: then one of its triangles is read and the other only written.
+    An array of the state that is symmetric at the start, and after every step from a symmetric one, is always
+    symmetric: then only one of its triangles is read, and the other is only written.
 
     Raises:
-        ValueError: random numbers, operations that are not lowered; with the operation and its place.
+        ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = item.init()
     leaves, tree = jax.tree.flatten(state)
@@ -60,11 +60,13 @@ def step_program(item: AbstractFilter) -> StepProgram:
         after, estimate = item.step(jax.tree.unflatten(tree, leaves), z, u, k)
         return jax.tree.leaves(after), estimate.mean, estimate.covariance
 
+    # Trace the step, and refuse random numbers: a device has none.
     program, _ = traced(step, leaves, z, u, k)
     equations = list(_equations(program.jaxpr))
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise no_c(equation.primitive.name, place(equation))
+    # Symmetry by induction: assume it for all arrays, drop those that a step does not keep symmetric, repeat.
     estimate, names = item.estimate(state), names_of(state)
     symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
     while True:
@@ -73,6 +75,7 @@ def step_program(item: AbstractFilter) -> StepProgram:
         if not lost:
             break
         symmetric -= lost
+    # Inputs are (state, z, u, k), outputs (state, mean, covariance).
     *buffers, of_z, of_u, of_k = inputs
     *after, mean, covariance = map(scalars, outputs)
     parts = zip(names, buffers, map(np.asarray, leaves), after, strict=True)
@@ -92,12 +95,13 @@ def step_program(item: AbstractFilter) -> StepProgram:
 
 
 def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:
-    """Graph, input buffers and output values; the last inputs are z, u and k."""
+    """Return graph, input buffers and output values; the last inputs are z, u and k."""
     lowering, inputs, values = DeviceLowering(), [], []
     graph = lowering.graph
     try:
         for number, variable in enumerate(program.jaxpr.invars):
             aval = variable.aval
+            # A symmetric array is read from its upper triangle.
             buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)
             inputs.append(buffer)
             if number != leaves:  # all but the measurement, of which components may be missing
@@ -115,18 +119,18 @@ def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGrap
 
 
 def no_c(operation: str, where: str) -> InputError:
-    """The one line on what cannot be exported."""
+    """Return an error, in one line, about an operation that cannot be exported."""
     return fail("export", "operations that C has", f"{operation} at {where}")
 
 
 def place_of(operation: str, equations: list[Any]) -> str:
-    """The line that an operation of the graph comes from."""
+    """Return the source line of an operation of the graph."""
     same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
     return next((place(e) for e in same), "an unknown line")
 
 
 def names_of(state: PyTree) -> list[str]:
-    """Names in C for the arrays of a state, after the fields in which they stand."""
+    """Return names in C for the arrays of a state, from their field names."""
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
         parts = (str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path)
@@ -143,7 +147,7 @@ def _is_symmetric(value: np.ndarray) -> bool:
 
 
 def _equations(jaxpr: Any) -> Iterator[Any]:
-    """All operations, those of programs inside too."""
+    """Yield all operations, also those of inner programs."""
     for equation in jaxpr.eqns:
         yield equation
         for part in equation.params.values():

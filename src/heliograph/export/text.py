@@ -1,4 +1,4 @@
-"""The two files of an exported step: a header that explains, and a source that computes."""
+"""Text of the two files of an exported step: a header with explanations, and a source that computes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,7 +24,7 @@ MEANING: dict[Claim, str] = {
 
 
 class Member(NamedTuple):
-    """An array in the state of the step: its name, type, start, and what it becomes."""
+    """An array in the state of the step: its name, type, initial values, and the values after a step."""
 
     name: str
     type: Type
@@ -33,7 +33,7 @@ class Member(NamedTuple):
 
 
 class Form(NamedTuple):
-    """How a step is written: the prefix of all names, the type of its numbers, names of z's components, what it is."""
+    """Options of the text: the prefix of all names, the type of numbers, names of z's components, and a description."""
 
     prefix: str
     real: Real
@@ -42,7 +42,7 @@ class Form(NamedTuple):
 
 
 class CText(NamedTuple):
-    """Header and source; how often each operation stands in a step; bytes of the state."""
+    """Header and source; the number of each operation in a step; bytes of the state."""
 
     header: str
     source: str
@@ -51,13 +51,14 @@ class CText(NamedTuple):
 
 
 def c_text(program: StepProgram, form: Form) -> CText:
-    """Write a step down.
+    """Write a step as C.
 
     Raises:
-        ValueError: an operation that C has not, with its place; numbers beyond single precision.
+        ValueError: an operation that C does not have, with its place; numbers beyond single precision.
     """
     prefix, real = form.prefix, form.real
     members, mean, covariance = _members(program)
+    # Where inputs are read: members of the state, z, u, and the step counter.
     places = {leaf.buffer: _entry(f"state->{leaf.name}") for leaf in program.leaves}
     places |= {program.z: _entry("z"), program.u: _entry("u"), program.k: lambda index: "state->step"}
     roots = [node for member in members for node in member.after]
@@ -66,6 +67,7 @@ def c_text(program: StepProgram, form: Form) -> CText:
         body = source.statements(program.graph.top)
     except Unsupported as error:
         raise no_c(error.operation, place_of(error.operation, program.equations)) from None
+    # The step counter is part of the state only if something depends on it.
     counts = program.k in source.needed or program.filter.horizon is not None
     finish = _finish(members, program, source, counts)
     text = _SOURCE.format(
@@ -79,6 +81,7 @@ def c_text(program: StepProgram, form: Form) -> CText:
         covariance=covariance,
         real=real,
     )
+    # The header declares the state and explains the functions.
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
@@ -94,7 +97,7 @@ def _entry(array: str) -> Place:
 
 
 def _members(program: StepProgram) -> tuple[list[Member], str, str]:
-    """The arrays of the state, and the names of those that hold the estimate: the filter's own where they are equal."""
+    """Return the arrays of the state, and the names of those that hold the estimate, which may be the filter's."""
     members = [Member(leaf.name, leaf.buffer.type, leaf.start.ravel().tolist(), leaf.after) for leaf in program.leaves]
     names = []
     for name, nodes, start in (
@@ -111,7 +114,7 @@ def _members(program: StepProgram) -> tuple[list[Member], str, str]:
 
 
 def _stored(type: Type, real: Real) -> str:
-    """The type in which a number is held: a flag is a byte."""
+    """Return the type in which a number is stored: a flag is a byte."""
     return "unsigned char" if type == "bool" else c_type(type, real)
 
 
@@ -121,7 +124,7 @@ def _fields(members: Sequence[Member], real: Real, counts: bool) -> list[str]:
 
 
 def _size(members: Sequence[Member], real: Real, counts: bool) -> int:
-    """Bytes of the state where each number lies at a multiple of its own size."""
+    """Return the bytes of the state, each number aligned to its own size."""
     sizes = {"f64": 8 if real == "double" else 4, "bool": 1, "i32": 4, "u32": 4, "i64": 8, "u64": 8}
     fields = [(sizes[m.type], max(len(m.start), 1)) for m in members] + ([(8, 1)] if counts else [])
     total = 0
@@ -141,7 +144,7 @@ def _start(members: Sequence[Member], real: Real, counts: bool) -> list[str]:
 
 
 def _checks(program: StepProgram, real: Real) -> list[str]:
-    """What is refused before anything is computed."""
+    """Return the statements that refuse invalid inputs before the computation."""
     item = program.filter
     lines = [] if item.received else ["    (void)z;"]
     lines += [] if item.inputs else ["    (void)u;"]
@@ -151,7 +154,7 @@ def _checks(program: StepProgram, real: Real) -> list[str]:
 
 
 def _finish(members: Sequence[Member], program: StepProgram, source: CSource, counts: bool) -> list[str]:
-    """Refuse an estimate that is no number; then write all that has changed."""
+    """Return the statements that refuse an estimate that is not finite, and then write all that changed."""
     known = [node for node in program.mean if node.op != "constant"]
     lines = [f"    if (!isfinite({source.name(node)})) return 4;" for node in dict.fromkeys(known)]
     for member in members:
@@ -161,13 +164,14 @@ def _finish(members: Sequence[Member], program: StepProgram, source: CSource, co
 
 
 def claim_of(item: AbstractFilter, real: Real) -> Claim:
-    """The filter's claim; in single precision nobody counts the digits that are lost, so that nothing is proved."""
+    """Return the filter's claim; single precision proves nothing, since its rounding is not bounded."""
     return item.claim if real == "double" or item.claim == "none" else "nominal"
 
 
 def _comment(program: StepProgram, form: Form) -> str:
-    """What a reader of the header needs to know."""
+    """Return the explanation for a reader of the header."""
     item, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
+    # States that are angles say so.
     circular = first(item.plant).circular if hasattr(item, "plant") else ()
     units = [" (radians, from -pi to pi)" if name in circular else "" for name in item.states]
     lines = [

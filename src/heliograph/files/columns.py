@@ -1,4 +1,4 @@
-"""Tables from wherever they are: a file, a DataFrame of pandas or polars, or columns by name."""
+"""Columns of a table from a file, a DataFrame of pandas or polars, or a dictionary."""
 
 import os
 from collections.abc import Mapping
@@ -15,15 +15,7 @@ TIME = "time"
 
 
 def columns_of(table: object, name: str = "table") -> dict[str, np.ndarray]:
-    """Columns by name, numbers as float64 and dates as datetime64[ns] in UTC; what is missing is NaN or NaT.
-
-    `table` is the path of a CSV or Parquet file, a DataFrame of pandas or polars, or a dictionary of arrays. An index
-    of pandas called "time" is a column too.
-
-    Raises:
-        ValueError: no such table, a column that holds neither numbers nor dates; one line that names the column.
-        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
-    """
+    """Return columns by name, numbers as float64 and dates as datetime64[ns] in UTC; missing values are NaN or NaT."""
     if isinstance(table, str | os.PathLike):
         return read_table(Path(table))
     if isinstance(table, Mapping):
@@ -42,7 +34,7 @@ def columns_of(table: object, name: str = "table") -> dict[str, np.ndarray]:
 
 
 def _values(values: Any, name: str) -> np.ndarray:
-    """One column, whose own kind of missing value may be another than NaN."""
+    """Convert one column, which may have a missing value other than NaN."""
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
@@ -57,7 +49,7 @@ def _values(values: Any, name: str) -> np.ndarray:
 
 
 def _of_objects(result: np.ndarray, name: str) -> np.ndarray:
-    """Numbers with None among them, or dates; text that reads as a number is none."""
+    """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
     some = next((item for item in result if item is not None), None)
     if isinstance(some, str) or hasattr(some, "isoformat"):
         return dates(result, name)

@@ -1,4 +1,4 @@
-"""A design in a TOML file: which network, what is free, the budget or the target error, and what else is shown."""
+"""Design problem in a TOML file: network, free powers, budget or target error, and further results."""
 
 import tomllib
 from collections.abc import Callable, Mapping
@@ -47,10 +47,10 @@ class DesignFile:
 
 
 def read_design(path: Path) -> DesignFile:
-    """Read the file; names of Python files in it are relative to its folder.
+    """Read a design file; names of Python files in it are relative to its folder.
 
     Raises:
-        ValueError: no TOML, keys or values that are none, a network that cannot be loaded; one line with the key.
+        ValueError: no TOML, unknown keys or values, a network that cannot be loaded; one line with the key.
     """
     if not path.is_file():
         raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
@@ -58,10 +58,12 @@ def read_design(path: Path) -> DesignFile:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise fail(f"design {path.name}", "TOML", str(error)) from None
+    # Unknown keys, at the top and in the tables.
     _check_keys(path.name, table, KEYS)
     for key, known in TABLES.items():
         if isinstance(table.get(key), dict):
             _check_keys(f"{path.name}, {key}", table[key], known)
+    # Network and problem.
     file, name = _place(path, table.get("network"), "network")
     free = table.get("free")
     if free is not None and (not isinstance(free, list) or not all(isinstance(item, str) for item in free)):
@@ -76,6 +78,7 @@ def read_design(path: Path) -> DesignFile:
         starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
         seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
     )
+    # Further results: front, exponent of the path loss, map.
     front = table.get("front")
     return DesignFile(
         reference=f"{file.name}:{name}" if name else file.name,
@@ -112,7 +115,7 @@ def _map(path: Path, table: Mapping[str, object]) -> MapPlaces:
 
 
 def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
-    """The Python file and the name in it."""
+    """Return the Python file and the name in it."""
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
     place, colon, name = value.rpartition(":")
@@ -139,9 +142,10 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
 
 
 def designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
-    """Python source of the network with these powers, which reads that as it was from `source` in the same folder."""
+    """Return Python source of the network with these powers; it loads the original from `source` in the same folder."""
     error = file.problem.criterion
     _, colon, name = file.reference.rpartition(":")
+    # The original is loaded relative to the file, so that the folder can be moved.
     place = f'str(Path(__file__).with_name("{source}"))' + (f' + ":{name}"' if colon else "")
     return "\n".join([
         '"""A network with designed powers, and the best linear filters for them."""',

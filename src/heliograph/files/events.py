@@ -1,4 +1,4 @@
-"""Events in files: one row for each thing that was heard, in any order, with names of nodes and perhaps dates."""
+"""Files of events: one row for each received message, in any order, with names of nodes and possibly dates."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ NODE, SEQUENCE, TIME, ARRIVAL, VALUES = "node", "sequence", "time", "arrival", "
 
 
 def holds_events(path: str | Path) -> bool:
-    """Whether a CSV or Parquet file has events and not rows: it has the columns `node` and `sequence`."""
+    """Return whether a CSV or Parquet file has events instead of rows: it has the columns `node` and `sequence`."""
     path = Path(path)
     if not path.is_file() or path.suffix.lower() not in FORMATS:
         return False
@@ -29,21 +29,29 @@ def holds_events(path: str | Path) -> bool:
 
 
 def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.datetime64 | None]:
-    """Events from a CSV or Parquet file; times are seconds since the moment returned where the file has dates.
+    """Read events from a CSV or Parquet file; times are seconds since the returned date if the file has dates.
 
-    Columns: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (may be left out: at once), and what was heard:
-    one column for each component, named as the sensor's outputs or the plant's inputs, or one column `values` with all
-    of the node's numbers, separated by spaces or as a list. An empty cell did not arrive. Dates are ISO 8601, with a
-    zone each or none; the moment returned is the earliest `time`. A sequence keeps every digit. In CSV quotes around a
-    cell mean nothing; in Parquet text is no number.
+    Columns: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), and the values: one column
+    for each component, named as the sensor's outputs or the plant's inputs, or one column `values` with all of the
+    node's numbers, separated by spaces or as a list. An empty cell did not arrive. Dates are ISO 8601, all with a time
+    zone or all without. A sequence keeps every digit. In CSV quotes around a cell mean nothing; in Parquet text is not
+    converted to numbers.
+
+    Args:
+        path: the file.
+        network: the network that the names belong to.
+
+    Returns:
+        The events in order of the rows, and the earliest `time` if times are dates, else None.
 
     Raises:
-        ValueError: missing or unknown columns, a cell that is none of this; one line that names the row, from 1.
+        ValueError: missing or unknown columns, an invalid cell; one line that names the row, from 1.
     """
     path = Path(path)
     columns = _columns(path)
     components = {name: node.received_names for name, node in network.nodes.items()}
     components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+    # Unknown columns are most likely misspelt: refuse them.
     known = [NODE, SEQUENCE, TIME, ARRIVAL, VALUES, *(name for names in components.values() for name in names)]
     for name in columns:
         if name not in known:
@@ -51,6 +59,7 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
     for name in (NODE, SEQUENCE, TIME):
         if name not in columns:
             raise fail(f"{path}, header", f"a column {name!r}", f"only {', '.join(columns)}")
+    # Rows to events; errors name the row.
     time, arrival, origin = _times(columns, path)
     events = []
     for row, node in enumerate(columns[NODE]):
@@ -64,9 +73,9 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
 
 
 def run_events(path: Path, network: Network, out: Path, window: float, lag: float | None) -> tuple[Record, list[str]]:
-    """Final estimates from a file of events, and lines to tell of it: verdicts, and where the lagged ones are.
+    """Return final estimates from a file of events, and a summary in lines: verdicts, and the file of lagged estimates.
 
-    With a lag these are written to a file beside `out`: estimates.csv becomes estimates.lagged.csv.
+    With a lag these are written next to `out`: estimates.csv becomes estimates.lagged.csv.
 
     Raises:
         ValueError: what `read_events` and `Timeline` refuse, a lag beyond the window.
@@ -104,7 +113,8 @@ def _header(path: Path) -> list[str]:
 
 
 def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
-    """Cells as they stand: texts in CSV, whatever a Parquet file holds."""
+    """Return the cells as they are stored: text in CSV, any type in Parquet."""
+    # Parquet: text is accepted only as names, values and dates.
     if path.suffix.lower() == ".parquet":
         import pyarrow.parquet as pq
 
@@ -115,6 +125,7 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
                 if isinstance(cell, str) and not (name in (TIME, ARRIVAL) and looks_like_date(cell)):
                     raise fail(f"{path}, row {at}, column {name!r}", "a number", f"text, {shown(cell)}")
         return results
+    # CSV: all rows must have as many cells as the header.
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *rows = [[cell.strip() for cell in line] for line in csv.reader(file, strict=True) if line]
@@ -129,7 +140,7 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
 
 
 def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndarray, np.ndarray, np.datetime64 | None]:
-    """Times and arrivals as numbers, and the moment that they are counted from if they were dates."""
+    """Return times and arrivals as numbers, and the date that they are counted from if they were dates."""
     parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
     first = columns[TIME][0]
     if hasattr(first, "isoformat") or looks_like_date(str(first)):
@@ -152,7 +163,7 @@ def _refuse_missing(missing: np.ndarray, name: str) -> None:
 
 
 def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
-    """The numbers of one event."""
+    """Return the values of one event."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
         parts = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
@@ -163,7 +174,7 @@ def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.nd
 
 
 def _whole(cell: Any, name: str) -> int:
-    """A count, every digit of it; one written as a float if that holds it exactly."""
+    """Return a count with every digit; a float is accepted if it is an exact integer."""
     try:
         result = int(cell) if isinstance(cell, str) else cell
     except ValueError:

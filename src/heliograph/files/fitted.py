@@ -1,4 +1,4 @@
-"""What a fit found, as a file, and the network with it: `fitted.json` and a Python file beside it that loads it."""
+"""Files of a fit: `fitted.json`, and next to it a Python file that loads the network with the fitted numbers."""
 
 import json
 import os
@@ -34,7 +34,7 @@ network = hg.files.load_fitted({reference}, HERE / "{fitted}")
 
 @dataclass(frozen=True)
 class NetworkAgain:
-    """The network of a file or module, built anew at each call: what `hg.free` marks in it may stand anywhere.
+    """Loader of the network of a file or module, which builds it anew at each call, so that `hg.free` is called again.
 
     A file is run again; of an installed module a function that returns the network is called again.
     """
@@ -42,12 +42,12 @@ class NetworkAgain:
     reference: str
 
     def __call__(self) -> Network:
-        """Load it."""
+        """Load the network."""
         return load_network(self.reference)
 
 
 def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
-    """Values by name, the table, the sentences and how the search went, as JSON has them; None for NaN."""
+    """Return values by name, the table, the sentences and the search, for JSON; NaN becomes null."""
     return {
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
@@ -61,10 +61,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
 
 
 def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, place: Path) -> None:
-    """Write `fitted.json` and `fitted_network.py` into a folder that will stand at `place`, where it finds the network.
-
-    A file is found by its way from there, so that both may be moved together.
-    """
+    """Write `fitted.json` and `fitted_network.py` into a folder that will be renamed to `place`."""
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     path, colon, name = _parts(reference)
     if path is None:
@@ -78,12 +75,14 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
 
 
 def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
-    """The network of a file or module, with the numbers in it that `hg.free` marks as a fit found them.
+    """Load the network of a file or module, with the fitted numbers in place of those that `hg.free` marks.
 
-    `reference` as for `load_network`; `fitted` is the file that `heliograph fit` wrote.
+    Args:
+        reference: path of the file or name of the module, as for `load_network`.
+        fitted: path of the `fitted.json` of a fit.
 
     Raises:
-        ValueError: as `load_network`; no such file of numbers, or numbers that are not those which are free.
+        ValueError: what `load_network` refuses; a file that is no result of a fit of this network.
     """
     file_path("network", reference)
     path, description = file_path("fitted numbers", fitted), describe(NetworkAgain(str(reference)))
@@ -102,7 +101,7 @@ def _plain(value: object) -> object:
 
 
 def _parts(reference: str) -> tuple[Path | None, str, str]:
-    """Path, colon and name; no path of a module."""
+    """Split a reference into path, colon and name; modules have no path."""
     place, colon, name = reference.rpartition(":")
     if not place or not name.isidentifier():
         place, colon, name = reference, "", ""

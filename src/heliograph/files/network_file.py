@@ -1,4 +1,4 @@
-"""A network from a user's own Python module."""
+"""Networks from a user's own Python modules."""
 
 import importlib
 import os
@@ -20,14 +20,17 @@ T = TypeVar("T")
 
 
 def load_network(reference: str) -> Network:
-    """The network in "my_network.py", "my_network.py:name" or "package.module:name".
+    """Load a network from "my_network.py", "my_network.py:name" or "package.module:name".
 
-    Without a name the module must hold exactly one network; the name may also be that of a function without
-    arguments that returns one. A file finds other modules in its own folder, as a script does.
+    Without a name the module must have exactly one network; the name may also be that of a function without arguments
+    that returns one. A file finds other modules in its own folder, as a script does.
+
+    Args:
+        reference: path of the file or name of the module, optionally with a colon and the name of the network.
 
     Raises:
-        ValueError: no such module, an error inside it (with its type, message and line), no network, or several
-            and no name. One line that names the module.
+        ValueError: no such module, an error inside it (with its type, message and line), no network, or several and no
+            name. One line that names the module.
     """
     file_path("network", reference)
     place, _, name = str(reference).rpartition(":")
@@ -47,14 +50,16 @@ def load_network(reference: str) -> Network:
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
-    """The function `name` of a Python file with this source, which need not be the file's; it returns a network.
+    """Load the function `name`, which returns a network, from a source; `path` is the file that the source is of.
 
-    The module finds others in the file's folder, when it is loaded and when the function is called.
+    The source need not be the file's present one. The module finds others in the file's folder, when it is loaded and
+    when the function is called.
 
     Raises:
         ValueError: as `load_network`; calling the function raises the same.
     """
     place = f"{path.name}:{name}"
+    # The module itself, then the function in it.
     with _importing_from(path.parent):
         module = _guarded(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
@@ -62,6 +67,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
         came = "an unknown name" if function is None else type(function).__name__
         raise fail(f"network {place}", "a function that returns a heliograph.Network", came)
 
+    # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
         with _importing_from(path.parent):
@@ -104,7 +110,7 @@ def _named(module: ModuleType, name: str, place: str, path: Path | None, network
 
 
 def _source(module: str) -> Path | None:
-    """The file of an importable module, whose errors are then reported with their line."""
+    """Return the file of an importable module, so that errors are reported with their line."""
     spec = find_spec(module)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {module!r}")
@@ -116,7 +122,7 @@ def _run_file(path: Path) -> ModuleType:
 
 
 def _run_source(path: Path, source: str | bytes) -> ModuleType:
-    """Run a file's source as a module of its own; unlike an import, nothing is written beside it."""
+    """Run a file's source as a module; unlike an import, this writes no cache next to it."""
     name = f"heliograph_network_{path.stem}"
     spec = spec_from_file_location(name, path)
     if spec is None:
@@ -141,7 +147,7 @@ def _guarded(call: Callable[[], T], name: str, path: Path | None) -> T:
 
 
 def _line(error: BaseException, path: Path | None) -> str:
-    """Where in the user's file the error arose: the innermost frame there."""
+    """Return the line in the user's file where an error was raised: the innermost frame there."""
     if isinstance(error, SyntaxError):
         return f" in line {error.lineno}"
     if path is None:

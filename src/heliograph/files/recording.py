@@ -1,4 +1,4 @@
-"""Measured data in, estimates out: a table of times, inputs and measurements, and one of means and covariances."""
+"""Recordings and estimates in files: a table of times, inputs and measurements; one of means and covariances."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,10 +22,10 @@ TIME_STEP = "dt"  # an input of this name is filled with the time since the prev
 
 @readable
 class Recording(NamedTuple):
-    """Measured data as `heliograph.run` takes it: `run(network, *recording)`.
+    """Measured data in the form of the arguments of `heliograph.run`: `run(network, *recording)`.
 
-    Shapes: measurements[node] (steps, received), NaN where one did not arrive; inputs (steps, inputs); time (steps,),
-    numbers or dates (datetime64[ns], UTC).
+    Shapes: measurements[node] (steps, received), NaN where a component did not arrive; inputs (steps, inputs); time
+    (steps,), numbers or dates (datetime64[ns], UTC).
     """
 
     measurements: dict[str, np.ndarray]
@@ -37,11 +37,15 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
     """Read measured data for a network from a CSV or Parquet file, a DataFrame, or a dictionary of columns.
 
     Columns: `time`, numbers or dates of ISO 8601, which never goes backwards; each plant input by its name (an input
-    `dt` may be left out: it is the time since the previous row in the time's own unit, of dates in seconds, and 0 in
-    the first); each received component by `node.name` or, where only one thing has that name, by `name`. Components are
-    named as the sensor's outputs where the channel keeps their number, else z0, z1, ... A measurement that is empty or
-    NaN did not arrive. What a relay heard may be left out altogether. `name` is what errors call a table that is no
-    file.
+    `dt` may be left out: it is the time since the previous row in the unit of `time`, for dates in seconds, and 0 in
+    the first row); each received component by `node.name` or, if the name is unique, by `name`. Components are named as
+    the sensor's outputs if the channel keeps their number, else z0, z1, ... A measurement that is empty or NaN did not
+    arrive. Measurements of a relay may be left out altogether.
+
+    Args:
+        table: path of the file, DataFrame, or columns by name.
+        network: the network that the columns belong to.
+        name: name of a table without a file, for errors.
 
     Raises:
         ValueError: no table of numbers; unknown, missing or doubled columns; a time or an input that is missing;
@@ -54,7 +58,12 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
-    """Write a recording to a CSV or Parquet file that `read_recording` reads: time, inputs, and what was received.
+    """Write a recording to a CSV or Parquet file that `read_recording` reads: time, inputs, and measurements.
+
+    Args:
+        recording: the measured data.
+        network: the network that the data belong to; it names the columns.
+        path: the file, ending in .csv or .parquet.
 
     Raises:
         ValueError: names that coincide, another format, or a folder that cannot be written.
@@ -71,6 +80,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
     inputs, received = network.inputs, _received_columns(network)
+    # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
             del received[name]  # its own filter is left out
@@ -82,6 +92,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     def find(names: tuple[str, ...]) -> str:
         return _find(columns, names, source)
 
+    # Time must not go backwards.
     time = _times(columns, find((TIME,)), source)
     row = backwards(time)
     if row is not None:
@@ -91,6 +102,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
         node: np.stack([_measured(columns, find(names), source) for names in components], axis=1)
         for node, components in received.items()
     }
+    # Inputs; a missing dt is the difference of the times.
     u = np.zeros((len(time), len(inputs)))
     for i, name in enumerate(inputs):
         fill = name == TIME_STEP and name not in columns
@@ -99,17 +111,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
 
 
 def estimate_columns(record: Record) -> dict[str, np.ndarray]:
-    """The estimates of a recording as columns.
-
-    `time`; then for each filter the mean `STATE`, the standard deviation `STATE.sd`, the covariances `cov.A.B` (A
-    before B in the state), and `valid`: false where mean or covariance are not finite, or the covariance is no
-    longer positive semidefinite. A filter that claims no covariance has no columns for one. Each name starts with
-    `NODE.` where there are several nodes, and with `FILTER.` where a node has several filters. What was estimated given
-    later data too has the same columns under `smoothed.`, from the row on that it begins with.
-
-    Raises:
-        ValueError: Monte Carlo runs, or names that coincide.
-    """
+    """Return the estimates of a recording as columns."""
     columns = [(TIME, record.time)]
     several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
@@ -127,7 +129,11 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
 
 
 def write_estimates(record: Record, path: str | Path) -> None:
-    """Write `estimate_columns` to a CSV or Parquet file, whole or not at all; in CSV, valid is 1 or 0.
+    """Write `estimate_columns` to a CSV or Parquet file, as a whole or not at all; in CSV, valid is 1 or 0.
+
+    Args:
+        record: the result of `run`.
+        path: the file, ending in .csv or .parquet.
 
     Raises:
         ValueError: another format, or a folder that cannot be written.
@@ -154,13 +160,13 @@ def _claims(states: Sequence[str], estimate: Estimate) -> list[tuple[str, np.nda
 
 
 def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
-    """The last rows of a column; those before are NaN, or false."""
+    """Extend a column at its start by NaN, or false, to a number of rows."""
     none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
     return np.concatenate([none.astype(values.dtype), values])
 
 
 def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
-    """For each node and component the names its column may have, the preferred one first."""
+    """Return the allowed column names of each node's components, the preferred one first."""
     names = {node: item.received_names for node, item in network.nodes.items()}
     uses = Counter([TIME, *network.inputs])
     for node, components in names.items():

@@ -1,4 +1,4 @@
-"""Tables in files: columns of numbers read from and written to CSV or Parquet; the extension decides."""
+"""Tables in files: columns of numbers in CSV or Parquet; the file extension selects the format."""
 
 import csv
 import re
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 
 from heliograph.disk.output_file import check_output, format_of
 from heliograph.disk.quoting import from_cell, in_cell
@@ -18,15 +19,21 @@ SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
 
 
-def read_table(path: str | Path) -> dict[str, np.ndarray]:
-    """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN. Rows count from 1.
+def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
+    """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN.
 
     A column whose first cell is a date of ISO 8601, as 2026-11-21T23:25:00+01:00, is read as dates: datetime64[ns] in
-    UTC. Dates without a zone are taken as they stand.
+    UTC. Dates without a time zone are not converted.
+
+    Args:
+        path: the file, ending in .csv or .parquet.
+
+    Returns:
+        Columns by name, each of shape (rows,).
 
     Raises:
-        ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no
-            number.
+        ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no number.
+            Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     path = file_path("table", path)
@@ -41,11 +48,16 @@ def read_table(path: str | Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Write columns of equal length to a CSV or Parquet file; the file appears whole or not at all.
+def write_table(columns: Mapping[str, Shaped[np.ndarray, "..."]], path: str | Path) -> None:
+    """Write columns of equal length to a CSV or Parquet file; the file appears as a whole or not at all.
+
+    Args:
+        columns: arrays by name, each of shape (rows,), of numbers, booleans or dates.
+        path: the file, ending in .csv or .parquet.
 
     Raises:
-        ValueError: another format, or a folder that cannot be written.
+        ValueError: another format, columns that are not arrays of one axis and length, or a folder that cannot be
+            written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     path = file_path("table", path)
@@ -56,7 +68,7 @@ def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
 
 
 def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError unless these are arrays of one axis and one length, by name."""
+    """Raise ValueError unless all columns are arrays of one axis and one length."""
     named = table("columns of a table", columns, "arrays")
     for name, column in named.items():
         if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "fiubM":
@@ -73,6 +85,7 @@ def _check_distinct(path: Path, header: Sequence[str]) -> None:
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    # Cells as text; every row must have as many as the header.
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = (line for line in csv.reader(file, strict=True) if line)
@@ -81,6 +94,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+    # The first row decides which columns are dates; all others are numbers.
     dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
     numbers = [
         [np.nan if i in dated else _number(path, header[i], row, cell) for i, cell in enumerate(cells)]
@@ -131,7 +145,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
 
 
 def _rewriting(path: Path, **how: str) -> str:
-    """What makes a table of ours of one that is written in another way."""
+    """Return the pandas call that converts a table written in another dialect."""
     given = "".join(f", {name}={value!r}" for name, value in how.items())
     return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
@@ -140,6 +154,7 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    # The whole table; names must be distinct.
     try:
         table = pq.ParquetFile(path).read()
     except pa.ArrowInvalid as error:
@@ -147,6 +162,7 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     _check_distinct(path, table.column_names)
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
+        # Timestamps keep their nanoseconds; other temporal types and nested ones are refused.
         kind = column.type
         if pa.types.is_timestamp(kind):
             columns[name] = np.array(column.cast(pa.timestamp("ns", kind.tz)).to_numpy(), dtype="datetime64[ns]")

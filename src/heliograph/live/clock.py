@@ -1,4 +1,4 @@
-"""What a network's time is: steps, or seconds that an input of the plant counts; and whether these may be cut anew."""
+"""Time of a network: step numbers, or seconds that an input counts; and whether intervals can be divided."""
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,11 @@ TOLERANCE = 1e-9  # relative: a few products lose 1e-15
 
 
 def time_input(network: Network) -> int | None:
-    """Which input of the plant is the time since the row before; None where time counts steps.
+    """Return the index of the plant's input that is the time since the previous row; None if time counts steps.
 
     Raises:
-        ValueError: a plant that takes dt where something else goes by steps: it varies over time, or remembers.
+        ValueError: a plant with the input dt in a network with parts that need step numbers: they vary over time or
+            have memory.
     """
     if TIME_STEP not in network.inputs:
         return None
@@ -35,13 +36,14 @@ def time_input(network: Network) -> int | None:
 
 
 def uneven(plant: AbstractPlant, dt: int) -> str:
-    """How a plant differs over an interval from itself over the interval's parts; "" where it does not.
+    """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
 
-    f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. It
-    is tried around the initial mean, with the other inputs 1; s = 0 and t = 0 are among the cuts.
+    f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
+    test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
     """
     with jax.enable_x64(True):
         mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
+        # At the initial mean, and one standard deviation from it.
         for x in (mean, mean + spread):
             for s, t in CUTS:
                 whole, parts = _moved(plant, dt, x, (s + t,)), _moved(plant, dt, x, (s, t))
@@ -55,7 +57,7 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
 def _moved(
     plant: AbstractPlant, dt: int, x: np.ndarray, parts: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """State, Jacobian and covariance of the noise after these intervals."""
+    """Return state, Jacobian and noise covariance after these intervals."""
     n = len(x)
     state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
     for part in parts:

@@ -1,4 +1,4 @@
-"""What is pushed to a timeline, and what it says of it."""
+"""Events that are pushed to a timeline, and its verdicts on them."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -14,9 +14,14 @@ INPUTS = "inputs"  # the node whose events are the plant's inputs
 
 
 class Event(NamedTuple):
-    """What `node` measured at `time`, its number there, and when it was heard (None: at once); NaN did not arrive.
+    """Measurement of a node at one time. Events of the node "inputs" are the plant's inputs, without "dt".
 
-    Those of the node "inputs" are the plant's inputs, without "dt", which a timeline counts itself.
+    Args:
+        node: name of the node, or "inputs".
+        sequence: the node's running count, from 0.
+        time: moment of the measurement, in steps or seconds.
+        values: measured values; NaN did not arrive. Shape (received,) of the node.
+        arrival: moment of arrival; None means at once.
     """
 
     node: str
@@ -27,7 +32,7 @@ class Event(NamedTuple):
 
 
 class Known(NamedTuple):
-    """An event as numbers, with the place of its node in the network, -1 of inputs."""
+    """An event as numbers, with the index of its node in the network, -1 for inputs."""
 
     place: int
     sequence: int
@@ -37,19 +42,19 @@ class Known(NamedTuple):
 
     @property
     def name(self) -> tuple[int, int, float]:
-        """What tells it from others. The time is part of it, since numbers come again after a reboot."""
+        """Return the key of the event. It contains the time, since counts start again after a reboot."""
         return self.place, self.sequence, self.time
 
 
 def whole(name: str, value: object) -> int:
-    """A whole number that counts: from 0, of 63 bits."""
+    """Check a count: an integer from 0 of 63 bits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= int(value) < 2**63:
         raise fail(name, WHOLE, shown(value))
     return int(value)
 
 
 def moment(name: str, value: object) -> float:
-    """A finite number: times are counted from an origin, dates have none."""
+    """Check a time: a finite number, since times are counted from an origin."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise fail(name, "a finite number", shown(value))
     if not np.isfinite(value):
@@ -58,7 +63,7 @@ def moment(name: str, value: object) -> float:
 
 
 def numbers(name: str, value: ArrayLike, size: int) -> Float[np.ndarray, " size"]:
-    """A copy of `size` real numbers, NaN where one did not arrive; a single one need not be a list."""
+    """Copy `size` real numbers, NaN where one did not arrive; a single one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
         values = np.array(value)

@@ -1,4 +1,4 @@
-"""Rows on the device: what was heard at each, what the filters knew after it, and the one program that replays them."""
+"""Rows in device memory: measurements, the filters' states after them, and the program that steps through them."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -22,9 +22,10 @@ OUTPUTS = "estimates", "fused", "judged", "judged_centrally"
 
 
 class History(NamedTuple):
-    """Rows in slots, in any order: what all nodes heard, what inputs were given (NaN where nothing was), and when.
+    """Rows in slots, in any order: measurements of all nodes, inputs (NaN where none was given), and the time.
 
-    After each row: the filters' states, the inputs held, the number of the step, and the leaves of what they tell.
+    For each row there are also the filters' states after it, the inputs held, the step number, and the leaves of the
+    outputs.
 
     Shapes: rows (slot, received + given + 1), held (slot, given), step (slot,).
     """
@@ -36,18 +37,18 @@ class History(NamedTuple):
     outputs: list[jax.Array]
 
     def parts(self, slot: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """What was heard at a row, what was given, and its time."""
+        """Return the measurements, the inputs and the time of a row."""
         given = self.held.shape[1]
         row = self.rows[slot]
         return row[: -given - 1], row[-given - 1 : -1], row[-1]
 
     def known(self, slot: jax.Array) -> PyTree:
-        """The filters' states after a row."""
+        """Return the filters' states after a row."""
         return jax.tree.map(lambda leaf: leaf[slot], self.state)
 
 
 class NetworkStep(Module):
-    """All filters of a network; `places` of each group's nodes in a row of all that is heard, (node, received)."""
+    """Step of all filters of a network; `places` are the indices of each group's nodes in a row, (node, received)."""
 
     filters: AllFilters
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
@@ -58,27 +59,28 @@ class NetworkStep(Module):
         self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """One step of all, without what is implausible; what they tell is "estimates" by kind and "fused" by name.
+        """Step all filters, without implausible measurements; return the states and the outputs.
 
-        And "judged" and "judged_centrally" of what was heard, by kind and by name.
+        The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
+        kind and "judged_centrally" by name.
         """
         after, result = plausible_step(self.filters, state, self.groups(received), u, k)
         return after, {name: result[name] for name in OUTPUTS}
 
     def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """The same with all that was heard, implausible or not."""
+        """Step all filters with every measurement, implausible or not."""
         after, result = self.filters.step(state, self.groups(received), u, k)
         return after, {name: result[name] for name in OUTPUTS}
 
     def without(
         self, first: tuple[PyTree, PyTree], state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, PyTree]:
-        """The step again, where each filter leaves out what it finds implausible."""
+        """Repeat the step, each filter without the measurements that it finds implausible."""
         after, result = step_without(self.filters, first, state, self.groups(received), u, k)
         return after, {name: result[name] for name in OUTPUTS}
 
     def groups(self, received: jax.Array) -> list[jax.Array]:
-        """What each group's nodes heard, (node, received)."""
+        """Return the measurements of each group's nodes, (node, received)."""
         return [received[np.array(place)] for place in self.places]
 
 
@@ -87,12 +89,14 @@ Replay = Callable[..., tuple[History, list[jax.Array]]]
 
 @lru_cache
 def replay(static: Static, dt: int | None) -> Replay:
-    """The program (numbers, tape, row, order, (slot, start, stop)) -> (tape, what is told after the last row).
+    """Compile the program (numbers, history, row, order, (slot, start, stop)) -> (history, outputs after the last row).
 
     It writes the row to the slot, and steps the filters over the slots order[start:stop], from the state after
-    order[start - 1]. The tape is given away. `dt`: which input is the time since the row before; None where time counts
-    steps: then the steps between two rows are taken too, with nothing heard. Compiling never knows how many there are.
+    order[start - 1]. The history is donated: its buffers are reused. `dt` is the index of the input that is the time
+    since the previous row; None means that time counts steps, in which case the steps between two rows are taken too,
+    without measurements. The program does not depend on the number of rows.
     """
+    # Continuous time: one step between two rows. Discrete time: as many as their step numbers differ by.
     move = _by_steps if dt is None else _over_time(dt)
 
     def run(
@@ -101,6 +105,7 @@ def replay(static: Static, dt: int | None) -> Replay:
         item: NetworkStep = static.filled(numbers)
         slot, start, stop = place
 
+        # One row: from the state after the previous one in the order; the results go to the slot of the row.
         def single(i: jax.Array, history: History) -> History:
             now = order[i]
             state, held, step, outputs = move(item, history, order[i - 1], now)
@@ -117,11 +122,11 @@ def replay(static: Static, dt: int | None) -> Replay:
     return jax.jit(run, donate_argnums=1, compiler_options=understood())
 
 
-Moved = tuple[PyTree, jax.Array, jax.Array, list[jax.Array]]  # after a row: states, inputs held, step, what is told
+Moved = tuple[PyTree, jax.Array, jax.Array, list[jax.Array]]  # after a row: states, inputs held, step, outputs
 
 
 def _over_time(dt: int) -> Callable[[NetworkStep, History, jax.Array, jax.Array], Moved]:
-    """One step over the time between two rows, with the inputs held in between."""
+    """Return the step over the time between two rows, with the inputs held in between."""
 
     def move(item: NetworkStep, history: History, before: jax.Array, now: jax.Array) -> Moved:
         step, u = history.step[before] + 1, interval(history, before, now, dt)
@@ -132,12 +137,12 @@ def _over_time(dt: int) -> Callable[[NetworkStep, History, jax.Array, jax.Array]
 
 
 def interval(history: History, before: jax.Array, now: jax.Array, dt: int) -> jax.Array:
-    """The inputs of a plant of continuous time from one row to another."""
+    """Return the inputs of a plant of continuous time from one row to another."""
     return jnp.insert(history.held[before], dt, history.parts(now)[2] - history.parts(before)[2])
 
 
 def _by_steps(item: NetworkStep, history: History, before: jax.Array, now: jax.Array) -> Moved:
-    """The steps between two rows with nothing heard, and that of the row, to which its own inputs lead."""
+    """Take the steps between two rows without measurements, then the step into the row."""
     last = history.parts(now)[2].astype(history.step.dtype)
 
     def single(k: jax.Array, carry: tuple[PyTree, list[jax.Array]]) -> tuple[PyTree, list[jax.Array]]:
@@ -150,13 +155,13 @@ def _by_steps(item: NetworkStep, history: History, before: jax.Array, now: jax.A
 
 
 def held_after(history: History, before: jax.Array, now: jax.Array) -> jax.Array:
-    """The inputs held after a row."""
+    """Return the inputs held after a row."""
     given = history.parts(now)[1]
     return jnp.where(jnp.isnan(given), history.held[before], given)
 
 
 def at_step(history: History, before: jax.Array, now: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What is heard and given at step k, which is the row's or one between it and the row before."""
+    """Return measurements and inputs at step k, which is the row's or one between it and the previous row."""
     received, _, last = history.parts(now)
     there = k == last.astype(history.step.dtype)
     u = jnp.where(there, held_after(history, before, now), history.held[before])
@@ -165,12 +170,12 @@ def at_step(history: History, before: jax.Array, now: jax.Array, k: jax.Array) -
 
 @jax.jit
 def read(outputs: list[jax.Array], slots: jax.Array) -> list[jax.Array]:
-    """What was told after the rows in these slots, READ of them: what is on the tape itself must not be looked at."""
+    """Read the outputs after the rows in these READ slots; the donated buffers themselves must not be read."""
     return [leaf[slots] for leaf in outputs]
 
 
 def copied(history: History) -> list[np.ndarray]:
-    """The leaves of a tape, which goes on to be used."""
+    """Copy the leaves of a history that remains in use."""
     return [np.asarray(leaf) for leaf in _copy(jax.tree.leaves(history))]
 
 

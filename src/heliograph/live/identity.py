@@ -1,4 +1,4 @@
-"""What something is to whoever kept its state: a state goes on only where everything computes as it did."""
+"""Identity of a saved state: it may only continue where everything is computed as before."""
 
 from collections.abc import Mapping
 from hashlib import sha256
@@ -16,15 +16,12 @@ DIGITS = 16
 
 
 def versions() -> Identity:
-    """Of what computes."""
+    """Return the versions of this package and of JAX."""
     return {"heliograph": heliograph.__version__, "jax": jax.__version__}
 
 
 def network_identity(network: Network, program: str, options: Mapping[str, object]) -> Identity:
-    """Versions, precision, options, names and sizes; of each part of the network its numbers; and of what is computed.
-
-    What is computed is read off the compiler's input, `program`: a function of the plant counts by what it does.
-    """
+    """Return versions, precision, options, names, sizes, hashes of each part's numbers, and a hash of the program."""
     parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": item for name, item in network.fused.items()}
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
@@ -43,11 +40,7 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
 
 
 def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> None:
-    """Refuse what was kept of something else, and say in what it differs.
-
-    Raises:
-        ValueError: anything that differs.
-    """
+    """Refuse a saved state of something else, and name the difference."""
     names = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
     if names:
         here = "; ".join(f"{name}: {mine.get(name, 'none')}" for name in names)
@@ -56,7 +49,7 @@ def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> 
 
 
 def short_name(part: PyTree) -> str:
-    """A short name of all numbers in a part, or of a text."""
+    """Hash all numbers in a part, or a text."""
     if isinstance(part, str):
         return sha256(part.encode()).hexdigest()[:DIGITS]
     result = sha256()

@@ -1,4 +1,4 @@
-"""What later rows of a tape say of an earlier moment: the program that sweeps back over them."""
+"""Smoothing of an earlier moment by the later rows of a history: the program that sweeps back over them."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -30,17 +30,17 @@ SmootherStep: TypeAlias = (
 
 
 class Sweep(Module):
-    """The filters of a network that can be smoothed, by `kinds`, and the fusions of these."""
+    """The filters of a network that can be smoothed, by `kinds`, and their fusions."""
 
     network_step: NetworkStep
     fusions: tuple[Fused, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
-    structure: jax.tree_util.PyTreeDef = eqx.field(static=True)  # of what is told after a row
+    structure: jax.tree_util.PyTreeDef = eqx.field(static=True)  # of the outputs after a row
 
     def step(
         self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, SmootherStep]:
-        """One step of all into a row, with what a sweep back over it needs; without what was implausible there."""
+        """Step all filters into a row, without implausible measurements; return also their smoother steps."""
         local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
         skip = local, {name: central[name] for name in self.network_step.filters.central}
         after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
@@ -50,7 +50,7 @@ class Sweep(Module):
         )
 
     def start(self, history: History, slot: jax.Array) -> PyTree:
-        """The filters' states after a row of the tape."""
+        """Return the filters' states after a row of the history."""
         local, central, *_ = history.known(slot)
         return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}
 
@@ -64,7 +64,7 @@ class Sweep(Module):
 
 
 def _over_filters(function: Callable[..., object], steps: SmootherStep, *rest: PyTree) -> PyTree:
-    """A function of one filter's step for those of each kind, (filter, node, ...), and for the central ones."""
+    """Map a function of one filter's step over the filters of each kind, (filter, node, ...), and the central ones."""
     local = {
         kind: jax.vmap(jax.vmap(function))(step, *(part[0][kind] for part in rest)) for kind, step in steps[0].items()
     }
@@ -81,11 +81,12 @@ Into: TypeAlias = "Callable[[Sweep, History, jax.Array, Place], SmootherStep]"
 
 @lru_cache
 def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
-    """The program (numbers, tape, order, (begin, stop)) -> estimates after the row order[begin], given those after it.
+    """Compile (numbers, history, order, (begin, stop)) -> estimates after row order[begin], given the rows after it.
 
-    Rows are order[begin:stop], begin > 0. What a step leaves is computed anew from the state before it, and so is what
-    is between rows where time counts steps.
+    Rows are order[begin:stop], begin > 0. The smoother's terms of a step are computed again from the state before it,
+    and so are the steps between rows where time counts steps.
     """
+    # Continuous time: one step per row. Discrete time: also the steps between the rows.
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
     def run(numbers: list[jax.Array], history: History, order: jax.Array, place: jax.Array) -> PyTree:
@@ -93,10 +94,12 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
         begin, stop = place
         last = stop - 1, history.step[order[stop - 1]]
         count = stop - 1 - begin if dt is not None else last[1] - history.step[order[begin]]
+        # Shapes of a smoother step, without computing one.
         blank = jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, history, order, last))
         )
 
+        # One step back: x_k|N from x_(k+1)|N and the smoother step into row k + 1; at the last row x_N|N.
         def single(i: jax.Array, carry: tuple[Place, SmootherStep, PyTree]) -> tuple[Place, SmootherStep, PyTree]:
             now, steps, later = carry
             before = into(item, history, order, now)
@@ -125,7 +128,7 @@ def _earlier_row(history: History, order: jax.Array, place: Place) -> Place:
 
 
 def _into_step(item: Sweep, history: History, order: jax.Array, place: Place) -> SmootherStep:
-    """By way of the steps from the row before, at which nothing was heard."""
+    """Compute the smoother step at step k, by way of the steps without measurements since the previous row."""
     before, now, k = order[place[0] - 1], order[place[0]], place[1]
 
     def single(j: jax.Array, state: PyTree) -> PyTree:
@@ -141,7 +144,7 @@ def _earlier_step(history: History, order: jax.Array, place: Place) -> Place:
 
 
 class Sweeper:
-    """The program of a network, with its numbers, and how its results are called."""
+    """The smoothing program of a network, with its numbers and the names of its results."""
 
     def __init__(self, network: Network, dt: int | None, structure: jax.tree_util.PyTreeDef):
         self.network = network
@@ -163,7 +166,7 @@ class Sweeper:
         return item.quantizers is None and all(kind in kinds for source in item.sources for kind, _ in source)
 
     def estimates(self, history: History, order: np.ndarray, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
-        """Estimates after a row given the rows after it, by node and filter."""
+        """Return estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
             local, fused = self._run(self._numbers, history, order, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
@@ -189,7 +192,7 @@ def _of(network: Network, kind: int, name: str) -> AbstractFilter:
 
 
 def _can_smooth(item: AbstractFilter) -> bool:
-    """Whether a filter can be smoothed."""
+    """Return whether a filter can be smoothed."""
     u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
     try:
         with jax.enable_x64(True):

@@ -1,4 +1,4 @@
-"""What the timelines of one network share: compiled programs, and the numbers of the filters where these find them."""
+"""Compiled programs of a network, shared by its timelines, and the arrays that the programs are called with."""
 
 from functools import cached_property
 from typing import Any
@@ -23,15 +23,16 @@ from heliograph.simulation.stepping import AllFilters, begun
 
 
 class Player:
-    """A network's filters compiled, their numbers where the program finds them: what all its timelines share.
+    """A network's filters, compiled, with their arrays: shared by all timelines of the network.
 
-    `structure` of what is told; `uneven`: how the plant cannot be cut in time, "" if it can. A tape's rows have
-    `received` numbers and `given` inputs.
+    `structure` is that of the outputs; `uneven` explains why the plant's intervals cannot be divided, "" if they can.
+    The rows of a history have `received` measurements and `given` inputs.
     """
 
     def __init__(self, network: Network):
         self.network, self.dt = network, time_input(network)
         self.uneven = "" if self.dt is None else uneven(first(network.plant), self.dt)
+        # Sizes of a row: measurements of all nodes, and inputs other than dt.
         self.claims, inputs = network.claims(), len(network.inputs)
         self.received = sum(node.received for node in network.nodes.values())
         self.given = inputs - (self.dt is not None)
@@ -41,6 +42,7 @@ class Player:
                 if link.uplinks.groups:
                     expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
                     raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
+            # Arrays apart from structure: the program is called with the arrays only.
             network_step = NetworkStep(network, filters)
             self.numbers, static = cast(network_step)
             self.start = begun(network_step.filters)
@@ -50,7 +52,7 @@ class Player:
         self.replay, self._judges = replay(static, self.dt), Judges(network)
 
     def why(self, outputs: list[np.ndarray], node: str) -> str | None:
-        """Why what a node said at a row is implausible, from what was told after it; None if it is not."""
+        """Explain why a node's event at a row is implausible, from the outputs after the row; None if it is not."""
         result = jax.tree.unflatten(self.structure, outputs)
         return (
             why_inputs(self._judges.of_all(result))
@@ -60,7 +62,7 @@ class Player:
 
     @cached_property
     def sweeper(self) -> Sweeper:
-        """What smooths these filters; made when it is first asked for.
+        """Return the smoother of these filters, compiled at the first call.
 
         Raises:
             ValueError: no filter that can be smoothed.
@@ -69,7 +71,7 @@ class Player:
 
     @cached_property
     def identity(self) -> Identity:
-        """What the network and its program are to a timeline that was saved."""
+        """Return the identity of the network and its program, which a saved timeline is compared with."""
         two = np.zeros(2, dtype=np.int32)
         program: Any = self.replay  # the compiler's functions have no type that says so
         with jax.enable_x64(True):
@@ -80,7 +82,7 @@ class Player:
         return network_identity(self.network, lowered.as_text(), {})
 
     def blank(self, slots: int, time: float) -> History:
-        """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
+        """Return an empty history, with the filters' priors in slot 0, at `time`."""
         rows = np.full((1, self.received + self.given + 1), np.nan)
         rows[0, -1] = time
         state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.start)
@@ -89,14 +91,14 @@ class Player:
         return self.filled(slots, begun)
 
     def filled(self, slots: int, some: tuple[PyTree, ...]) -> History:
-        """A tape with these rows in its first slots; in the others the first again, which nobody reads."""
+        """Return a history with these rows in its first slots; the others repeat the first row and are never read."""
 
         def repeated(part: np.ndarray) -> jax.Array:
             rest = np.repeat(part[:1], slots - len(part), axis=0)
             both = np.concatenate([part, rest])
             copied: jax.Array = jax.device_put(
                 both, may_alias=False
-            )  # a tape is given away; without a program for each shape
+            )  # no alias, since a history is donated; device_put compiles nothing
             return copied
 
         with jax.enable_x64(True):
@@ -107,7 +109,7 @@ _SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id o
 
 
 def player(network: Network) -> Player:
-    """The one of this network."""
+    """Return the player of this network, made at the first call."""
     result = _SHARED.get(id(network))
     if result is None:
         result = _SHARED[id(network)] = Player(network)

@@ -1,4 +1,4 @@
-"""Recorded events through a timeline: what became final, and what was known of each moment a lag later."""
+"""Replay of recorded events through a timeline: final estimates, and those of each moment a lag later."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +16,14 @@ from heliograph.simulation.results.record import Record
 
 @dataclass(frozen=True)
 class Played:
-    """Final estimates after each row, those of the same moments given what came a lag later, and the verdicts.
+    """Results of a replay.
 
-    `lagged` has each moment at which a node was heard by then, once; None without a lag.
+    Attributes:
+        final: final estimates, one entry a row.
+        lagged: smoothed estimates of each moment with a measurement, given the events up to a lag later; None without a
+            lag.
+        counts: numbers of events by node and verdict.
+        forced: number of rows that became final early, for lack of room.
     """
 
     final: Record
@@ -30,21 +35,30 @@ class Played:
 def play(
     network: Network, events: Sequence[Event], window: float, lag: float | None = None, start: float = 0.0
 ) -> Played:
-    """Push events in the order of their arrival, and let time pass until all are final.
+    """Push events in order of arrival, and advance the time until all are final.
+
+    Args:
+        network: the network that the events belong to.
+        events: at least one event, in any order.
+        window: how late an event may be, in the unit of time of the network.
+        lag: fixed lag of the smoothed estimates, at most `window`; None for no smoothing.
+        start: start of continuous time (default 0).
 
     Raises:
-        ValueError: no events, and what `Timeline` refuses; a lag beyond the window.
+        ValueError: no events, a lag beyond the window, and what `Timeline` refuses.
     """
     if not events:
         raise fail("events", "at least one", "none")
     if lag is not None and not 0 <= lag <= window:
         raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
     timeline = Timeline(network, window, start)
+    # Order of arrival; without an arrival time an event arrives when it is measured.
     coming = sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
     finals: list[Record] = []
     lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
     waiting: list[float] = []  # moments of which the lag has not passed
 
+    # Fixed-lag smoothing: estimates of each moment, once a lag has passed and before anything later arrives.
     def look(until: float) -> None:
         while lag is not None and waiting and waiting[0] + lag < until:
             moment = heappop(waiting)
@@ -53,6 +67,7 @@ def play(
             timeline.advance(moment + lag)
             lagged.append((moment, timeline.lagged(min(timeline.now - moment, window))))
 
+    # Final estimates are collected before the timeline would drop any.
     for i, event in enumerate(coming):
         look(event.time if event.arrival is None else event.arrival)
         if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
@@ -60,6 +75,7 @@ def play(
         if (i + 1) % timeline.capacity == 0:
             finals.append(timeline.final())
     look(np.inf)
+    # The rest becomes final.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
     late = None if lag is None else _record(network, lagged)

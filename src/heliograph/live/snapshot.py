@@ -1,4 +1,4 @@
-"""A timeline as bytes: what is held, as arrays of NumPy's own format, under a head of JSON."""
+"""Serialisation of a timeline: arrays in NumPy's own format, under a head of JSON."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ HEAD = "head"
 
 
 def packed(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Bytes of both."""
+    """Serialise a head and arrays."""
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
     np.savez(file, allow_pickle=False, **{HEAD: written, **arrays})
@@ -23,11 +23,7 @@ def packed(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> byte
 
 
 def unpacked(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Head and arrays.
-
-    Raises:
-        ValueError: bytes that are no snapshot.
-    """
+    """Read a head and arrays."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -37,7 +33,7 @@ def unpacked(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def row_arrays(rows: Sequence[HeldRow]) -> dict[str, np.ndarray]:
-    """Keys of rows, and their events: row, name, values one after another."""
+    """Return keys of rows, and their events as arrays: row, name, values one after another."""
     events = [(i, *name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
     return {
         "row.time": np.array([row.key[0] for row in rows]),
@@ -49,7 +45,7 @@ def row_arrays(rows: Sequence[HeldRow]) -> dict[str, np.ndarray]:
 
 
 def rows_from(arrays: Mapping[str, np.ndarray], numbers: np.ndarray, sizes: Mapping[int, int]) -> list[HeldRow]:
-    """The rows again, one slot after another; `numbers` of each, `sizes` of the values by place."""
+    """Restore rows in consecutive slots, from the `numbers` of each and the `sizes` of the values by node."""
     rows = []
     for i, (time, (place, sequence)) in enumerate(zip(arrays["row.time"], arrays["row.name"], strict=True)):
         key: Key = (float(time), int(place), int(sequence))

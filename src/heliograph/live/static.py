@@ -1,4 +1,4 @@
-"""What objects that differ in numbers alone share: so they share compiled programs, called with arrays only."""
+"""Structure of an object apart from its arrays, so that objects with equal structure share compiled programs."""
 
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
@@ -11,22 +11,22 @@ from heliograph.numerics.types import PyTree
 
 
 class Static(NamedTuple):
-    """The structure of an object, and its leaves: None stands for an array. Hashable, so a program may depend on it.
+    """Structure of an object and its leaves, with None in place of arrays. Hashable, as a static argument must be.
 
-    A program is called with arrays only, since telling apart what is none costs more than all the rest of a step.
+    Programs take arrays only: filtering out other leaves at each call would cost more than the step itself.
     """
 
     tree: PyTree
     parts: tuple[Hashable, ...]
 
     def filled(self, numbers: Sequence[jax.Array]) -> PyTree:
-        """The object with these arrays."""
+        """Return the object with these arrays."""
         rest = iter(numbers)
         return self.tree.unflatten([next(rest) if part is None else part for part in self.parts])
 
 
 def cast(item: object) -> tuple[list[jax.Array], Static]:
-    """An object's arrays, where a program finds them, and the rest of it. Call it in the float64 scope."""
+    """Split an object into arrays, on the device, and its structure. To be called in the float64 scope."""
     leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, item))
     numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape
     return numbers, Static(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))

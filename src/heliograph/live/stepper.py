@@ -1,4 +1,4 @@
-"""A filter's step on live data, judged and refused in one program: native code where it takes the filter, else XLA."""
+"""A filter's step on live data with its plausibility check, in one program: native code if possible, else XLA."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -21,7 +21,7 @@ Leaves = list[np.ndarray]
 
 
 class NativeStepper:
-    """One filter's state, stepped in its place by native code."""
+    """State of one filter, stepped in place by native code."""
 
     def __init__(self, code: Alone, numbers: Leaves, state: Leaves):
         self._code = code.again(numbers)
@@ -33,32 +33,32 @@ class NativeStepper:
 
     @property
     def state(self) -> Leaves:
-        """Copies of the leaves of the filter's state."""
+        """Return copies of the leaves of the filter's state."""
         return [leaf.copy() for leaf in self._state]
 
     def put(self, leaves: Sequence[np.ndarray]) -> None:
-        """Take these leaves as the filter's state."""
+        """Set the leaves of the filter's state."""
         for place, leaf in zip(self._state, leaves, strict=True):
             place[...] = leaf
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute a step; False, and the state as it was, where data are not finite or something is implausible."""
+        """Compute a step; False, with the state unchanged, if data are not finite or something is implausible."""
         self._z[...], self._u[...], self._k[...] = z, u, k
         self._code()
         return not self._flagged
 
     def accept(self) -> None:
-        """Take the state after a step that was flagged."""
+        """Accept the state after a step that was flagged."""
         self.put(self._after)
 
     @property
     def estimate(self) -> Leaves:
-        """The estimate's leaves after the step."""
+        """Return the leaves of the estimate after the step."""
         return [leaf.copy() for leaf in self._estimate]
 
 
 class XlaStepper:
-    """The same by a program of XLA."""
+    """State of one filter, stepped by a program of XLA."""
 
     def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
         self._run, self._numbers = run, numbers
@@ -67,16 +67,16 @@ class XlaStepper:
 
     @property
     def state(self) -> Leaves:
-        """The leaves of the filter's state."""
+        """Return the leaves of the filter's state."""
         return [np.asarray(leaf) for leaf in self._state]
 
     def put(self, leaves: Sequence[np.ndarray]) -> None:
-        """Take these leaves as the filter's state."""
+        """Set the leaves of the filter's state."""
         with jax.enable_x64(True):
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute a step; False, and the state as it was, where data are not finite or something is implausible."""
+        """Compute a step; False, with the state unchanged, if data are not finite or something is implausible."""
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
             judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
@@ -87,19 +87,19 @@ class XlaStepper:
         return True
 
     def accept(self) -> None:
-        """Take the state after a step that was flagged."""
+        """Accept the state after a step that was flagged."""
         self._state = self._after
 
     @property
     def estimate(self) -> Leaves:
-        """The estimate's leaves after the step."""
+        """Return the leaves of the estimate after the step."""
         return [np.asarray(leaf) for leaf in self._estimate]
 
 
 def _judged(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
-    """A step of every filter that differs in numbers alone: judgement, whether it is to be refused, state, estimate."""
+    """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate."""
     item: AbstractFilter = static.filled(numbers)
     after, estimate, judgement = item.step_judged(state, z, u, k)
     spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
@@ -109,7 +109,7 @@ def _judged(
 
 @lru_cache
 def by_xla(static: Static) -> Any:
-    """(numbers, state, z, u, k) to (judgement, whether it is to be refused, leaves of the state, of the estimate)."""
+    """Compile (numbers, state, z, u, k) to (judgement, whether to refuse, leaves of the state, of the estimate)."""
 
     def step(*data: PyTree) -> PyTree:
         return _judged(static, *data)
@@ -118,11 +118,7 @@ def by_xla(static: Static) -> Any:
 
 
 def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Alone | None:
-    """Code whose arguments are the leaves of numbers, state and data, z, u and k; None where XLA steps.
-
-    Raises:
-        ValueError: an engine that is none, or native code asked for of a filter that it does not take.
-    """
+    """Compile native code with arguments (numbers, state, z, u, k), flattened; None if XLA has to step the filter."""
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
     return _made(static, shapes, (len(numbers), len(leaves)), tree, setting())
@@ -132,11 +128,12 @@ def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: 
 def _made(
     static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Alone | None:
-    """The code, made once for each engine that is forced."""
+    """Compile the native code, once for each structure, set of shapes and engine."""
     numbers, state = counts
 
     def step(*leaves: jax.Array) -> PyTree:
         before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
+        # The step, and the state that replaces the old one: unchanged if the step was flagged.
         judged, flagged, after, estimate = _judged(static, leaves[:numbers], tree.unflatten(before), z, u, k)
         if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
@@ -144,6 +141,7 @@ def _made(
         return judged, flagged, after, estimate, placed  # what takes the state's place comes last
 
     def made() -> Alone:
+        # The last outputs are written over the arguments of the state.
         program = lower(step, *(np.zeros(shape, kind) for shape, kind in shapes))
         first = len(program.outputs) - state
         return Alone(program, {first + i: numbers + i for i in range(state)})

@@ -23,16 +23,20 @@ from heliograph.numerics.types import ArrayLike, PyTree
 
 @readable
 class Stream:
-    """Feed a filter one sample at a time, from one thread; it holds the filter's state and the step counter.
+    """One filter fed one sample at a time, from one thread; the stream holds its state and step number.
 
-    The numbers are those of `run` over the same data, up to rounding: the compiler orders and joins the operations of a
-    step as the program around it allows. Native code steps it, or XLA where native code does not take the filter.
+    The numbers agree with those of `run` over the same data up to rounding: the compiler orders and joins the
+    operations of a step as the surrounding program allows. Native code computes the steps, or XLA where native code
+    does not support the filter. Measurements that would spoil the state are refused (`push`).
 
-    `limits` and `invalid` as of a `Node`: numbers beyond them count as not arrived, and `dropped` counts them by
-    component. What would spoil the state is refused (`push`).
+    Args:
+        filter_: the filter to run.
+        limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived, and
+            `dropped` counts them by component.
+        invalid: codes for a missing value, as of a `Node`.
 
     Raises:
-        ValueError: no filter, limits that are none.
+        ValueError: no filter, or invalid limits.
     """
 
     def __init__(self, filter_: AbstractFilter, limits: LimitsLike = None, invalid: ArrayLike = ()):
@@ -46,13 +50,18 @@ class Stream:
         self._stepper = self._placed.stepper()
 
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> Estimate:
-        """Advance one step: `inputs` led to this `measurement` (NaN where a component did not arrive).
+        """Advance one step: `inputs` led to this `measurement`; return the posterior estimate.
+
+        Args:
+            measurement: received values, shape (received,); NaN where a component did not arrive.
+            inputs: the plant's inputs, shape (inputs,); by default none.
 
         Raises:
-            ValueError: a measurement or inputs that are not the filter's, infinite values, an input that is NaN, a
-                step past the end of what varies over time, what is implausible; the state stays as it was.
+            ValueError: a measurement or inputs of another size, infinite values, an input that is NaN, a step past the
+                end of what varies over time, implausible values; the state stays unchanged.
         """
         placed, k, stepper = self._placed, self.steps, self._stepper
+        # Arrays of doubles of the right size pass at once; everything else is checked and converted.
         z, outside = _row(measurement, placed.received), None
         if z is None or self.limits is not None:
             z = np.asarray(measured(self.filter, measurement))
@@ -60,10 +69,12 @@ class Stream:
         if u is None:
             u = np.asarray(given(self.filter, inputs))
         if self.limits is not None:
+            # Values beyond the limits count as not arrived.
             outside = self.limits.outside(z)
             z = np.where(outside, np.nan, z)
         if placed.horizon is not None and k >= placed.horizon:
             raise fail("step", f"one of the {placed.horizon} that the filter covers, counted from 0", k)
+        # The step itself; a flagged one is examined.
         if not stepper.step(z, u, k):
             self._refuse(z, u)
         self.steps = k + 1
@@ -73,10 +84,7 @@ class Stream:
         return with_sound_claim(result) if np.isnan(stepper.judgement[0]) else result
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
-        """Refuse what is implausible, or take the step that was flagged.
-
-        Implausible are inputs without which the prediction would keep its digits, or the measurement.
-        """
+        """Refuse implausible values, or accept the step that was flagged."""
         measured(self.filter, z)
         given(self.filter, u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
@@ -94,7 +102,7 @@ class Stream:
         stepper.accept()
 
     def save(self) -> bytes:
-        """State and steps, for `restore`: after it, the same pushes give the same bits."""
+        """Return state and step number for `restore`: after it, the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
         head = {"steps": self.steps, "dropped": self.dropped.tolist(), "of": self._placed.identity}
         return packed(head, leaves)
@@ -103,11 +111,7 @@ class Stream:
     def restore(
         cls, filter_: AbstractFilter, data: bytes, limits: LimitsLike = None, invalid: ArrayLike = ()
     ) -> "Stream":
-        """The stream that was saved, of the same filter; `limits` and `invalid` from here on.
-
-        Raises:
-            ValueError: bytes that `save` did not return; the state of another filter, version or precision.
-        """
+        """Restore a saved stream of the same filter; `limits` and `invalid` hold from here on."""
         new, (head, arrays) = cls(filter_, limits, invalid), unpacked(data)
         check_same("snapshot", new._placed.identity, head.get("of", {}))
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
@@ -115,7 +119,7 @@ class Stream:
         return new
 
     def __getstate__(self) -> dict[str, object]:
-        """Filter, steps and state, in double precision wherever it is read: what is compiled is no part of it."""
+        """Return filter, step number and state, in double precision; compiled programs are left out."""
         data = {name: value for name, value in vars(self).items() if name not in ("_placed", "_stepper")}
         return data | {"state": self._stepper.state}
 
@@ -128,7 +132,7 @@ class Stream:
 
 
 def _row(value: object, length: int) -> np.ndarray | None:
-    """So many doubles as they are in an array or a list; None for anything else, which takes longer to check."""
+    """Return an array or list as `length` doubles; None for anything else, which needs a slower check."""
     if type(value) is not np.ndarray and type(value) is not list:
         return None
     try:
@@ -139,7 +143,7 @@ def _row(value: object, length: int) -> np.ndarray | None:
 
 
 class _Placed:
-    """A filter compiled, its numbers where the program finds them: what all streams of the filter share."""
+    """A compiled filter with its arrays, shared by all streams of the filter."""
 
     def __init__(self, filter_: AbstractFilter):
         self.filter, self.horizon = filter_, filter_.horizon
@@ -151,7 +155,7 @@ class _Placed:
         self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
 
     def stepper(self) -> NativeStepper | XlaStepper:
-        """A state before the first step, and what steps it."""
+        """Return a stepper at the prior."""
         code = natively(self._static, self.numbers, self._start, self._data)
         if code is None:
             return XlaStepper(by_xla(self._static), self.numbers, self._start)
@@ -160,7 +164,7 @@ class _Placed:
 
     @cached_property
     def identity(self) -> Identity:
-        """Versions, names, numbers, and what a step computes, which counts for functions, whichever engine steps."""
+        """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
         with jax.enable_x64(True):
             text = by_xla(self._static).lower(self.numbers, self._start, *self._data).as_text()
         item = self.filter

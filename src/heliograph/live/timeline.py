@@ -1,4 +1,4 @@
-"""Events in any order: each gets a verdict and its place in time; estimates are those of all that was accepted."""
+"""Filters on events in any order: each event gets a verdict and its place in time."""
 
 import warnings
 from collections.abc import Mapping
@@ -28,11 +28,11 @@ from heliograph.simulation.results.record import Record
 
 @readable
 class Timeline:
-    """A network's filters on events that come late, out of order and twice.
+    """A network's filters on events that arrive late, out of order and twice.
 
-    Pushed in whatever order, the events that are accepted give the estimates of filters that had them in the order of
-    their times. What is older than now - `window` is final, now being the largest arrival; the newest final event is
-    the base, from which later ones are replayed. Each push gets one verdict, the first that holds:
+    Pushed in whatever order, the accepted events give the estimates of filters that had received them in order of time.
+    What is older than now - `window` is final, now being the latest arrival; the newest final event is the base, from
+    which later ones are replayed. Each push gets one verdict, the first that holds:
 
     - "future": its time is later than its arrival by more than `ahead`;
     - "late": it is before the base, in the order (time, node, sequence);
@@ -44,12 +44,19 @@ class Timeline:
 
     An event that is refused changes nothing. A plant with an input "dt" has continuous time, which starts at `start`;
     its other inputs are held from their event to the next, 0 before the first. Any other plant's time counts steps,
-    from 0, and inputs lead to the step of their time. Where time counts steps, and where nodes share a channel, one
-    row is made of all events of a time, and what is heard there twice is a conflict; else every event is a row.
+    from 0, and inputs lead to the step of their time. Where time counts steps, and where nodes share a channel, all
+    events of a time form one row, and a second measurement of a node at that time is a conflict; else every event is a
+    row.
 
-    At most `capacity` rows are held; beyond it the oldest become final, counted in `forced`. `counts` has the number
-    of each verdict by node, and under "inputs"; `dropped` how many single values were beyond a node's limits, which
-    counted as not arrived.
+    `counts` has the number of each verdict by node, and under "inputs"; `dropped` the number of single values beyond a
+    node's limits, which counted as not arrived; `forced` the number of rows that became final early.
+
+    Args:
+        network: the network whose filters run.
+        window: how late an event may be, in steps or seconds, at least 0.
+        start: start of continuous time (default 0); must be 0 where time counts steps.
+        ahead: how much later than its arrival the time of an event may be (default 0).
+        capacity: greatest number of rows held (default 1000); beyond it the oldest become final.
 
     Raises:
         ValueError: no network, a negative window, a node called "inputs", continuous time where parts go by steps.
@@ -68,14 +75,17 @@ class Timeline:
             raise fail("start", "0 where time counts steps", start)
         if what := self._player.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
+        # Index and size of each node's measurement, and of the inputs; counts by node.
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self._player.given
         self.counts = {name: dict.fromkeys(VERDICTS, 0) for name in self._sizes}
         self.dropped = dict.fromkeys(network.names, 0)
         self.forced = 0
+        # Slots on the device, and the prior as the base.
         slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
         begun = self.now if self._dt is not None else -1.0
         self._history, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
+        # Columns of each node in a row.
         ends = np.cumsum([size for _, size in self._sizes.values()])
         places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
         self._size = int(ends[-1])
@@ -86,7 +96,7 @@ class Timeline:
         self._latest: list[np.ndarray] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """All that is held, in double precision wherever it is read: what is compiled is no part of it."""
+        """Return the whole state, in double precision; compiled programs are left out."""
         stored = {name: value for name, value in vars(self).items() if name != "_player"}
         return stored | {"_history": to_numpy(self._history)}
 
@@ -120,7 +130,7 @@ class Timeline:
         return verdict
 
     def _within(self, event: Known, node: str) -> tuple[Known, int]:
-        """The event without what is beyond its node's limits, and how many values these were."""
+        """Remove an event's values beyond its node's limits; return the event and how many these were."""
         limits = None if node == INPUTS else self.network.nodes[node].limits
         outside = None if limits is None else limits.outside(event.values)
         if outside is None or not outside.any():
@@ -128,19 +138,12 @@ class Timeline:
         return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum())
 
     def advance(self, now: float) -> None:
-        """Let time pass: what is older than the window becomes final.
-
-        Raises:
-            ValueError: no finite number.
-        """
+        """Advance the time: what is older than the window becomes final."""
         self.now = max(self.now, moment("now", now))
         self._solve_steady()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
-        """Estimates at `now` from all that is held, by node and filter; those of several nodes stand under "fused".
-
-        Where time counts steps, at the last whole step, and at the last that the network covers.
-        """
+        """Return estimates at `now` by node and filter; those of several nodes are under "fused"."""
         newest, now = self._rows.keys[-1][0], self.now
         if self._dt is None:
             now = np.floor(min(now, self._end()))
@@ -149,25 +152,18 @@ class Timeline:
         return self._named(self._look(now, len(self._rows.held)))
 
     def _end(self) -> float:
-        """The last step that the network covers."""
+        """Return the last step that the network covers."""
         return np.inf if self._horizon is None else self._horizon - 1
 
     def _look(self, time: float, place: int) -> list[np.ndarray]:
-        """What the filters tell at a time after the row before `place`; it stands in a slot that no row has."""
+        """Predict to a time after the row before `place`, in a slot that no row has; return the outputs."""
         stored, self._order[place] = self._order[place], len(self._order) - 1
         outputs = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
         self._order[place] = stored
         return outputs
 
     def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
-        """Estimates at `now` - `lag` given all that is held, by node and filter: smoothed over the rows since then.
-
-        Where time counts steps, at the first step from there on. Filters that cannot be smoothed are left out, and
-        fusions that take quantized estimates or know of errors before later data.
-
-        Raises:
-            ValueError: a lag beyond the window, or to before the start; no filter that can be smoothed.
-        """
+        """Return smoothed estimates at `now` - `lag` given all events held, by node and filter."""
         if not 0 <= moment("lag", lag) <= self.window:
             raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
         time = self.now - lag if self._dt is not None else np.ceil(min(self.now, self._end()) - lag)
@@ -183,16 +179,17 @@ class Timeline:
         return self._player.sweeper.estimates(self._history, order, place, stop)
 
     def final(self) -> Record:
-        """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
+        """Return the estimates that became final since the last call, one for each row with a measurement.
 
-        They are the filters' own after the row, in the order of time. If nobody asks, the last 2 `capacity` are kept.
+        They are the filtered estimates after the row, in order of time. Without calls, the last 2 `capacity` of them
+        are kept.
         """
         self._collect()
         time, outputs = self._finals.take(self._history.outputs)
         return Record(time, self.network.states, None, {}, self._named(outputs))
 
     def save(self) -> bytes:
-        """All that is held, for `restore`: after it, the same pushes give the same bits."""
+        """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         self._collect()
         time, outputs = self._finals.take(self._history.outputs)
         self._finals.add(time, outputs)
@@ -206,15 +203,11 @@ class Timeline:
 
     @classmethod
     def restore(cls, network: Network, data: bytes) -> "Timeline":
-        """The timeline that was saved, of the same network.
-
-        Raises:
-            ValueError: bytes that `save` did not return; the state of another network, version or precision.
-        """
+        """Restore a saved timeline of the same network."""
         head, arrays = unpacked(data)
         check_same("snapshot", player(network).identity, head.get("of", {}))
         window, ahead, capacity = head["options"]
-        with warnings.catch_warnings():  # it was told when the timeline was made
+        with warnings.catch_warnings():  # the warning was given when the timeline was made
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
         leaves, structure = jax.tree.flatten(new._history)
@@ -223,7 +216,7 @@ class Timeline:
         return new
 
     def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: History) -> None:
-        """Hold what was saved."""
+        """Set the state from a saved one."""
         self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
         self.dropped = head["dropped"]
         slots, count = len(self._order), len(arrays["row.time"])
@@ -235,7 +228,7 @@ class Timeline:
         self._latest = [np.asarray(leaf)[-1] for leaf in saved.outputs] if begun else None
 
     def _known(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
-        """An event as numbers."""
+        """Convert an event to numbers."""
         if not isinstance(node, str) or node not in self._sizes:
             raise fail("node of an event", f"one of {', '.join(self._sizes)}", shown(node))
         place, size = self._sizes[node]
@@ -248,8 +241,9 @@ class Timeline:
         return Known(place, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
 
     def _used(self, event: Known) -> bool:
-        """Put the event into its row and replay from there; if it is implausible all is as it was before, and False."""
+        """Insert the event and replay from its row; if it is implausible, restore everything and return False."""
         place, row = self._rows.find(event)
+        # A new row takes a free slot; the order of slots makes room for it.
         before = None if row is None else (row.numbers.copy(), dict(row.events))
         if row is None:
             if not self._free:
@@ -259,10 +253,12 @@ class Timeline:
             self._order[place] = row.slot
             self._rows.insert(place, row)
         self._rows.fill(row, event)
+        # Replay from the row on, and judge the event by the outputs.
         latest = self._replayed(row, place, len(self._rows.held))
         if not self._refuses(event, row, place, latest):
             self._latest = latest
             return True
+        # Refused: restore the row or remove it, and replay what follows.
         if before is None:
             self._rows.remove(place)
             self._order[place : len(self._rows.held)] = self._order[place + 1 : len(self._rows.held) + 1].copy()
@@ -274,7 +270,7 @@ class Timeline:
         return False
 
     def _refuses(self, event: Known, row: HeldRow, place: int, latest: list[np.ndarray]) -> bool:
-        """Whether an event that was just replayed is implausible; an input also over one unit of time from its own."""
+        """Return whether a replayed event is implausible; inputs are also judged over one unit of time after them."""
         if place < len(self._rows.held) - 1:
             latest = self._published_at(row.slot)
         name = INPUTS if event.place < 0 else self.network.names[event.place]
@@ -284,13 +280,13 @@ class Timeline:
         return why is not None
 
     def _published_at(self, slot: int) -> list[np.ndarray]:
-        """What the filters told after the row in a slot."""
+        """Read the outputs after the row in a slot."""
         slots = np.full(READ, slot, dtype=np.int32)
         with jax.enable_x64(True):
             return [np.asarray(leaf)[0] for leaf in read(self._history.outputs, slots)]
 
     def _replayed(self, row: HeldRow, start: int, stop: int) -> list[np.ndarray]:
-        """Write a row and step over those of the order from `start` to `stop`; what is told after the last."""
+        """Write a row and step over order[start:stop]; return the outputs after the last row."""
         place = np.array([row.slot, start, stop], dtype=np.int32)
         with jax.enable_x64(True):
             self._history, outputs = self._player.replay(
@@ -299,7 +295,7 @@ class Timeline:
         return [np.asarray(leaf) for leaf in outputs]
 
     def _solve_steady(self) -> None:
-        """Move the base to where it belongs."""
+        """Move the base up to the watermark."""
         base, forced = self._rows.finalise(self.now - self.window)
         if not base:
             return
@@ -311,7 +307,7 @@ class Timeline:
         self._left += [row.slot for row in left]
 
     def _collect(self) -> None:
-        """Read what became final off the tape, and free the slots that nothing needs any more."""
+        """Read the outputs of final rows from the history, and free the slots that are no longer needed."""
         for begin in range(0, len(self._unread), READ):
             rows = self._unread[begin : begin + READ]
             slots = np.zeros(READ, dtype=np.int32)
@@ -323,7 +319,7 @@ class Timeline:
         self._unread, self._left = [], []
 
     def _named(self, outputs: list[np.ndarray]) -> dict[str, dict[str, Estimate]]:
-        """What was told, by node and filter."""
+        """Arrange outputs by node and filter."""
         result = jax.tree.unflatten(self._player.structure, outputs)
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)

@@ -1,4 +1,4 @@
-"""Curves over time in stacked panels, or over anything else with marks on it, each named at its right edge."""
+"""Curves over time in stacked panels, or over another quantity with marks on it, each named at its right edge."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from heliograph.report.figures import INK, STYLE, WIDTH, Curve, label_right
 
 @dataclass(frozen=True)
 class Panel:
-    """One set of axes: what its values are, and the curves (time,) in it."""
+    """One set of axes: the label of its values, and its curves (time,)."""
 
     label: str
     curves: Sequence[Curve]
@@ -20,10 +20,7 @@ class Panel:
 
 @matplotlib.rc_context(STYLE)
 def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "step") -> Figure:
-    """Panels one above the other over the same time; curves are named at the right, at the mean of their last tenth.
-
-    Shapes: time (time,), values of each curve (time,); NaN leaves a gap.
-    """
+    """Plot panels one above the other over the same time; curves are named at the mean of their last tenth."""
     figure = Figure(figsize=(WIDTH, 0.4 + 2.4 * len(panels)), layout="constrained")
     grid = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
     for axes, panel in zip(grid, panels, strict=True):
@@ -41,10 +38,7 @@ def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "st
 def curves_over(
     where: np.ndarray, panel: Panel, label: str, marks: Mapping[str, float] | None = None, logarithmic: bool = True
 ) -> Figure:
-    """One panel of curves over the values `where` of what `label` says; `marks` are named places on that axis.
-
-    Shapes: where (points,), values of each curve (points,); NaN leaves a gap.
-    """
+    """Plot curves in one panel over the values `where`, with axis label `label` and named places `marks` on it."""
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
     for curve in panel.curves:

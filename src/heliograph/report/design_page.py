@@ -1,4 +1,4 @@
-"""A design as figures and a page: the front, who sends how much, a map, the certificate, and the worth of changes."""
+"""Report of a design: Pareto front, powers by transmitter, map, certificate, and the value of changes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ SOURCE, DESIGNED = "network.py", "designed.py"
 
 @dataclass(frozen=True)
 class DesignResults:
-    """Everything that a design's page shows. `before`: mean power of each transmitter as the network is."""
+    """Content of the report of a design. `before`: mean power of each transmitter before the design."""
 
     reference: str
     source: str
@@ -37,25 +37,26 @@ class DesignResults:
 
 
 def design_results(results: DesignResults) -> Results:
-    """Everything that the folder holds."""
+    """Return the content of the results folder."""
     return Results(figures(results), partial(page, results), summary(results), partial(write_networks, results))
 
 
 def write_networks(results: DesignResults, folder: Path) -> None:
-    """Write the network as it was, and in the same folder the designed one, which reads it."""
+    """Write the original network, and in the same folder the designed one, which reads it."""
     (folder / SOURCE).write_text(results.source, encoding="utf-8")
     (folder / DESIGNED).write_text(results.written, encoding="utf-8")
 
 
 def mean_powers(design: PowerDesign) -> dict[str, float]:
-    """Mean power of each transmitter, zero where it is but rounding of the total."""
+    """Return the mean power of each transmitter, zero where it is only rounding of the total."""
     mean = {name: float(np.mean(power)) for name, power in design.powers.items()}
     return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
 
 
 def summary(results: DesignResults) -> dict[str, Json]:
-    """All numbers of the page."""
+    """Return all numbers of the report."""
     design, certificate = results.design, results.design.certificate
+    # JSON has no arrays: all numbers become lists.
     place = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
     return {
         "error": design.error,
@@ -75,7 +76,7 @@ def summary(results: DesignResults) -> dict[str, Json]:
 
 
 def figures(results: DesignResults) -> dict[str, Figure]:
-    """Front, powers, and the map if there is one, by file name."""
+    """Return the front, the powers, and the map if there is one, by file name."""
     drawn = {"front": front_figure(results.front, {"this design": (results.design.total, results.design.error)})}
     drawn["powers"] = powers_figure(results.before, mean_powers(results.design))
     if results.map is not None:
@@ -85,7 +86,7 @@ def figures(results: DesignResults) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
-    """Error over total power: the least found, the bound below which nothing is, and named points (power, error)."""
+    """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
     # a bound at some power holds for all less: hence steps
@@ -106,7 +107,7 @@ def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figu
 
 @matplotlib.rc_context(STYLE)
 def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
-    """Mean power of each transmitter, as it is and designed, a bar each."""
+    """Plot the mean power of each transmitter, original and designed, as bars."""
     names = sorted(after, key=lambda name: -after[name])[:MOST]
     names = [name for name in after if name in names]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.28 * len(names)), layout="constrained")
@@ -125,7 +126,7 @@ def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Fi
 
 @matplotlib.rc_context(STYLE)
 def map_figure(sites: SiteMap) -> Figure:
-    """The error over places, darker where it is smaller, with the best place."""
+    """Plot the error over places, darker where it is smaller, with the best place."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
     picture = axes.contourf(sites.x, sites.y, sites.errors, levels=14, cmap="cividis")
@@ -138,7 +139,7 @@ def map_figure(sites: SiteMap) -> Figure:
 
 
 def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
-    """The report; `drawings` holds each figure as SVG."""
+    """Return the report; `drawings` holds each figure as SVG."""
     design = results.design
     sections = [_result(results), _front(drawings), _powers(results, drawings)]
     if results.map is not None:

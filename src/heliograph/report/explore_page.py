@@ -1,4 +1,4 @@
-"""A page to explore a table in: axes, panels, colours and values to choose, drawn by Bokeh, which the page holds."""
+"""Page for exploring a table: axes, panels, colours and values to choose, drawn by Bokeh, which the page contains."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ Value = float | str | bool | None
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column that can be drawn, with that of its standard error; `level` is drawn as a line to compare with."""
+    """A column that can be plotted, with the column of its standard error; `level` is drawn as a reference line."""
 
     name: str
     label: str
@@ -27,11 +27,11 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Explored:
-    """A table by columns, and what is drawn of it. `name` is what tells it from the others on the page.
+    """A table by columns, and the first view of it. `name` distinguishes it from the others on the page.
 
-    dimensions: columns that tell the rows apart, in the order in which they are offered; `x`, `panel` and `colour` are
-    those of the first view. whole: the dimensions of which all values are in the first view; of the others, the first.
-    unordered: a dimension whose neighbours have nothing to do with each other: points along it are not connected.
+    `dimensions` are the columns that identify a row, in the order in which they are offered; `x`, `panel` and `colour`
+    are those of the first view. `whole`: the dimensions of which the first view shows all values; of the others it
+    shows the first. `unordered`: a dimension without an order: points along it are not connected.
     """
 
     name: str
@@ -46,11 +46,7 @@ class Explored:
 
 
 def explore_html(page: Page, tables: Sequence[Explored]) -> str:
-    """The page with tables to explore before its sections, as HTML that loads nothing from anywhere.
-
-    Raises:
-        ModuleNotFoundError: the extra `explore` is not installed.
-    """
+    """Return the page with tables to explore before its sections, as HTML that loads nothing else."""
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
         environment()

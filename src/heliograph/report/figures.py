@@ -1,4 +1,4 @@
-"""Figures in one style, without global state: draw one, then take it as `png` or `svg`."""
+"""Figures in one style, without global state: draw one, then export it as `png` or `svg`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ STYLE: Any = {  # of matplotlib's rcParams
 
 @dataclass(frozen=True)
 class Curve:
-    """One thing drawn by name in one colour: values (time,), (time, 2) for a path; `deviation` alike where claimed."""
+    """A named curve in one colour: values (time,), or (time, 2) for a path; `deviation` alike, if claimed."""
 
     name: str
     colour: str
@@ -51,10 +51,7 @@ class Curve:
 
 @matplotlib.rc_context(STYLE)
 def paths(truth: np.ndarray, curves: Sequence[Curve], beacons: np.ndarray) -> Figure:
-    """Paths on a map in metres, one panel for each, over the broad true path.
-
-    Shapes: truth (time, 2), values of each curve (time, 2), beacons (beacon, 2).
-    """
+    """Plot paths on a map in metres, one panel for each, over the true path."""
     figure = Figure(figsize=(WIDTH, WIDTH / len(curves) + 0.9), layout="constrained")
     row = figure.subplots(1, len(curves), squeeze=False, sharex=True, sharey=True)[0]
     for axes, curve in zip(row, curves, strict=True):
@@ -73,12 +70,13 @@ def paths(truth: np.ndarray, curves: Sequence[Curve], beacons: np.ndarray) -> Fi
 def errors_with_bands(
     time: np.ndarray, curves: Sequence[Curve], components: Sequence[str], sigmas: float = 2.0, unit: str = "m"
 ) -> Figure:
-    """Signed error of each curve (row) and component (column) within its claimed band of +-`sigmas` deviations.
+    """Plot the signed error of each curve (row) and component (column) in its claimed band of +-`sigmas` deviations.
 
     Shapes: time (time,) s from the start; values and deviation of each curve (time, component).
     """
     figure = Figure(figsize=(WIDTH, 0.6 + 1.4 * len(curves)), layout="constrained")
     grid = figure.subplots(len(curves), len(components), squeeze=False, sharex=True, sharey=True)
+    # One panel for each curve and component: error e and the band +- sigmas sqrt(P_ii).
     for row, curve in zip(grid, curves, strict=True):
         for i, (axes, component) in enumerate(zip(row, components, strict=True)):
             if curve.deviation is not None:
@@ -90,6 +88,7 @@ def errors_with_bands(
         row[0].set_ylabel(f"error ({unit})")
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
+    # Axes are symmetric around zero and common to all panels.
     largest = max(abs(limit) for limit in axes.get_ylim())
     axes.set(xlim=(0.0, time[-1]), ylim=(-largest, largest))
     return figure
@@ -97,7 +96,7 @@ def errors_with_bands(
 
 @matplotlib.rc_context(STYLE)
 def consistency_over_time(time: np.ndarray, curves: Sequence[Curve], window: int) -> Figure:
-    """Each curve's NEES per dimension (time,), averaged over `window` rows, on a logarithmic axis; 1 is honest."""
+    """Plot each curve's NEES per dimension (time,), averaged over `window` rows, on a logarithmic axis; ideal is 1."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots()
     axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
@@ -112,7 +111,7 @@ def consistency_over_time(time: np.ndarray, curves: Sequence[Curve], window: int
 
 
 def label_right(axes: Axes, ends: Mapping[str, tuple[float, str]], gap: float = 0.065) -> None:
-    """Name curves at the right edge, at (value, colour), moved apart to `gap` of the axis where they would meet."""
+    """Name curves at the right edge, at (value, colour), at least `gap` of the axis apart."""
     to_axes = axes.transData + axes.transAxes.inverted()
     names = sorted(ends, key=lambda name: ends[name][0])
     heights = np.array([to_axes.transform((0.0, ends[name][0]))[1] for name in names])
@@ -124,7 +123,7 @@ def label_right(axes: Axes, ends: Mapping[str, tuple[float, str]], gap: float = 
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
-    """Name the curves of `axes` above all panels, where none of them is."""
+    """Place the legend of `axes` above all panels."""
     handles, names = axes.get_legend_handles_labels()
     local = axes.get_legend()
     if local is not None:
@@ -135,7 +134,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 @matplotlib.rc_context(STYLE)
 def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
-    """The figure as PNG."""
+    """Export the figure as PNG."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=dots_per_inch, facecolor="white")
     return buffer.getvalue()
@@ -143,7 +142,7 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 
 @matplotlib.rc_context(STYLE)
 def svg(figure: Figure) -> bytes:
-    """The figure as SVG with its text as outlines, the same bytes for the same figure."""
+    """Export the figure as SVG with its text as outlines, the same bytes for the same figure."""
     buffer = BytesIO()
     figure.savefig(buffer, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

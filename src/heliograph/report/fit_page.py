@@ -1,4 +1,4 @@
-"""What a fit found as figures and a page: estimates with intervals, what cannot be told, and what it changed."""
+"""Report of a fit: estimates with intervals, numbers that the data do not determine, and effects on filters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ BINS = 20
 
 @dataclass(frozen=True)
 class Learned:
-    """All that the page tells: the fit, from `learned` rows, and what it changed on the `held_out` rows after them."""
+    """Content of the report: the fit, from `learned` rows, and its effect on the `held_out` rows after them."""
 
     network: str
     measurements: str
@@ -36,13 +36,13 @@ class Learned:
 
     @property
     def starts(self) -> dict[str, float]:
-        """Where each number began."""
+        """Return the start value of each number."""
         parameters = self.fit.description.parameters
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
 
 def fit_figures(learned: Learned) -> dict[str, Figure]:
-    """Estimates; correlations of innovations before and after; pits, by file name."""
+    """Return figures by file name: estimates; correlations of innovations before and after; PITs."""
     drawn = {"estimates": _estimates(learned)}
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
     if tested:
@@ -55,13 +55,15 @@ def fit_figures(learned: Learned) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def _estimates(learned: Learned) -> Figure:
-    """A line for each number, on a scale of its own: start, estimates of both forms, intervals."""
+    """Plot each number on its own scale: start, estimates of both forms of the likelihood, intervals."""
+    # One panel for each number, since their units differ.
     rows = learned.fit.rows()[:MOST]
     forms = [solution.form for solution in learned.fit.solutions]
     by_form = {form: learned.fit.rows(form=form) for form in forms}
     figure = Figure(figsize=(WIDTH, 0.6 + 0.62 * len(rows)), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
+        # The form that counts is on top; a cross marks a number that the data do not determine.
         for j, form in enumerate(reversed(forms)):
             item = by_form[form][i]
             color = BLUE if j == 0 else MUTED
@@ -81,6 +83,7 @@ def _estimates(learned: Learned) -> Figure:
 def _correlations(tested: list[Change]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.7 + 1.6 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, item in zip(grid, tested, strict=True):
         for shift, color, part, label in ((-0.17, AMBER, item.before, "before"), (0.17, BLUE, item.after, "after")):
             assert part.test is not None
@@ -116,7 +119,7 @@ def _pits(received: list[Uniformity]) -> Figure:
 
 
 def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
-    """The report; `drawings` holds each figure as SVG."""
+    """Return the report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
         title=_finding(learned),
@@ -139,7 +142,7 @@ def _finding(learned: Learned) -> str:
 
 
 def _lead(learned: Learned) -> str:
-    """Whether the filters foretell more of what was held out."""
+    """Summarise whether the filters predict the held-out rows better than before."""
     whence = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
     outputs = [(change, change.gain) for change in learned.changes if change.gain is not None]
     if not outputs:
@@ -170,6 +173,7 @@ def _glance(learned: Learned) -> list[KeyFigures]:
 
 def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
     starts = learned.starts
+    # Start, estimate and interval of each number.
     rows = [
         [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
         for row in learned.fit.table
@@ -206,6 +210,7 @@ def _words(learned: Learned) -> list[Points | Text]:
 def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
     if not learned.changes:
         return []
+    # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.
     rows = []
     for change in learned.changes:
         test = [part.test for part in (change.before, change.after)]
@@ -221,6 +226,7 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
         "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
         "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it receives."
     )
+    # Table and figure of the innovations; histogram of the PITs if there is one.
     blocks: list[Table | Picture] = [Table(headers, rows, caption)]
     if "innovations" in drawings:
         text = "Correlations of innovations some rows apart, with 95 % intervals: white ones have none."
@@ -243,8 +249,10 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
 
 
 def _losses(learned: Learned) -> list[Section]:
-    """How measurements were lost, where some were."""
+    """Describe the statistics of lost measurements, where some were lost."""
+    # One row for each law of each node: parameters, and gain on held-out packets.
     rows = []
+    # One row for each law of each node: parameters, and gain on held-out packets.
     for node, loss in learned.losses.items():
         for name, law in loss.laws.items():
             said = loss.held_out.get(name)
@@ -263,5 +271,5 @@ def _losses(learned: Learned) -> list[Section]:
 
 
 def pages(learned: Learned) -> "partial[Page]":
-    """The page, once the figures are drawn."""
+    """Return the page, once the figures are drawn."""
     return partial(fit_page, learned)

@@ -1,4 +1,4 @@
-"""What a recording says of the network it came through: how its links did, and whether its filters' claims held."""
+"""Diagnosis of a network from a recording: reliability of its links, and tests of its filters' claims."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ SURE = 2.58  # standard errors: one warning in a hundred is a false one
 
 @dataclass(frozen=True)
 class Link:
-    """One component of what a node heard: whether it arrived (time,), and the values that did."""
+    """One component of a node's measurement: whether it arrived (time,), and the values that did."""
 
     node: str
     component: str
@@ -26,21 +26,21 @@ class Link:
 
     @property
     def share(self) -> float:
-        """Share of the rows in which it arrived."""
+        """Return the share of rows in which it arrived."""
         return float(self.arrived.mean())
 
     @property
     def longest_gap(self) -> int:
-        """Most rows in a row without it."""
+        """Return the greatest number of consecutive rows without it."""
         ends = np.flatnonzero(np.concatenate([[True], self.arrived, [True]]))
         return int(np.max(np.diff(ends)) - 1)
 
 
 @dataclass(frozen=True)
 class Listening:
-    """What one filter did not expect: innovations in units of its claim (time, m), and the test of them.
+    """Innovations of one filter in units of its claim (time, m), and the test of their whiteness.
 
-    Both are None of a filter that claims nothing, the test also where there are too few rows.
+    Both are None for a filter without a claim, the test also if there are too few rows.
     """
 
     node: str
@@ -52,14 +52,14 @@ class Listening:
 
 @dataclass(frozen=True)
 class Health:
-    """A record, and what it says of links and filters."""
+    """A record, with the diagnosis of links and filters."""
 
     record: Record
     links: list[Link]
     filters: list[Listening]
 
     def warnings(self) -> list[str]:
-        """One line for each thing that should make one think."""
+        """Return one line for each reason to doubt the network."""
         lines = list(self.record.failures())
         for link in self.links:
             name = f"{link.node}: {link.component}"
@@ -95,14 +95,16 @@ def _doubts(item: Listening) -> Iterator[str]:
 def examine(
     network: Network, record: Record, inputs: np.ndarray, advance: Callable[[str], object] = lambda what: None
 ) -> Health:
-    """Judge links and filters of a recording that was run through the network."""
+    """Diagnose links and filters of a recording that was run through the network."""
     received = record.measurements
+    # Links: when each component arrived.
     links = []
     for node in received:
         z, place = received[node], network.nodes[node]
         for i, name in enumerate(place.received_names):
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))
+    # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters = []
     for node, name, item, z in _listening(network, record):
         advance(f"testing {node}/{name}")
@@ -116,7 +118,7 @@ def examine(
 
 
 def _listening(network: Network, record: Record) -> Iterator[tuple[str, str, AbstractFilter, np.ndarray]]:
-    """Every filter with what it hears: those of the nodes, and central ones."""
+    """Yield every filter with its measurements (time, m): those of the nodes, then central ones."""
     for node, z in record.measurements.items():
         for name, item in network.nodes[node].filters.items():
             yield node, name, item, z

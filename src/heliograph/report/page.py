@@ -1,4 +1,4 @@
-"""One self-contained HTML page made of sections of blocks: text, key figures, tables, pictures and code."""
+"""Self-contained HTML page made of sections of blocks: text, key figures, tables, pictures and code."""
 
 import re
 from base64 import b64encode
@@ -13,7 +13,7 @@ VERDICTS = {"fails": "fails", "holds_vacuously": "true but empty", "holds": "hol
 
 @dataclass(frozen=True)
 class Text:
-    """Paragraphs; `**strong**` and backquoted code are understood, everything else is taken as it is."""
+    """Paragraphs; `**strong**` and backquoted code are marked up, all other text is literal."""
 
     paragraphs: Sequence[str]
     kind: str = "text"
@@ -21,7 +21,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Points:
-    """A list of points, written as paragraphs are."""
+    """A list of points, with the markup of paragraphs."""
 
     points: Sequence[str]
     kind: str = "points"
@@ -29,7 +29,7 @@ class Points:
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """One number to remember: what it says, the number with its unit, and a colour that names it in the figures."""
+    """A number to remember: its name, the number with its unit, and its colour in the figures."""
 
     label: str
     value: str
@@ -63,7 +63,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Judged:
-    """A statement and where it stands, what is printed there if that says more, what was found, and the verdict.
+    """A statement, its place in a paper, the printed value, the value found, and the verdict.
 
     `verdict` is one of VERDICTS.
     """
@@ -76,20 +76,20 @@ class Judged:
 
     @property
     def word(self) -> str:
-        """The verdict in words."""
+        """Return the verdict in words."""
         return VERDICTS[self.verdict]
 
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements with their verdicts, each of which is seen at any width; those that fail first."""
+    """Statements with their verdicts, readable at any width; failures come first."""
 
     statements: Sequence[Judged]
     kind: str = "statements"
 
     @property
     def judged(self) -> list[Judged]:
-        """By verdict, else in their own order."""
+        """Sort statements by verdict, else in their original order."""
         return sorted(self.statements, key=lambda item: list(VERDICTS).index(item.verdict))
 
 
@@ -104,7 +104,7 @@ class Picture:
 
     @property
     def address(self) -> str:
-        """The picture itself as a data address, so that the page needs no other file."""
+        """Return the picture as a data URL, so that the page needs no other file."""
         return "data:image/svg+xml;base64," + b64encode(self.svg).decode()
 
 
@@ -121,7 +121,7 @@ Block = Text | Points | KeyFigures | Table | Statements | Picture | Code
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of the page; `kind` is the class by which a page's own style finds it."""
+    """A titled part of the page; `kind` is its CSS class."""
 
     title: str
     blocks: Sequence[Block]
@@ -130,7 +130,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: a kicker above its title, a lead below, sections, and a last line."""
+    """A page: a kicker above its title, a lead below, sections, and a footer."""
 
     kicker: str
     title: str
@@ -139,12 +139,12 @@ class Page:
     footer: str = ""
 
     def html(self) -> str:
-        """The whole page as HTML that loads nothing from anywhere."""
+        """Return the page as HTML that loads nothing else."""
         return environment().get_template("page.html.j2").render(page=self)
 
 
 def environment() -> Environment:
-    """Where the templates of this room are found; everything that they are given is escaped."""
+    """Return the environment of this room's templates, in which all values are escaped."""
     result = Environment(
         loader=PackageLoader("heliograph.report", "."),
         autoescape=True,
@@ -157,7 +157,7 @@ def environment() -> Environment:
 
 
 def rich(text: str) -> Markup:
-    """Escape a text, then set `**strong**` and backquoted code."""
+    """Escape a text, then mark up `**strong**` and backquoted code."""
     safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))  # a number stays with what belongs to it
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
     return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))

@@ -1,4 +1,4 @@
-"""Progress bars for work of known steps, and honest estimates of the time that is left."""
+"""Progress bars for work of known size, with estimates of the remaining time."""
 
 import sys
 import time
@@ -13,15 +13,15 @@ LINE_EVERY = 60.0  # seconds between lines, where stderr is no terminal
 
 
 class Advance(Protocol):
-    """Hears what begins, or how much of what began is done."""
+    """Callback that reports which stage begins, or how much of the current one is done."""
 
     def __call__(self, what: str, done: int = 0, total: int = 0) -> None:
-        """`done` of `total`, where that can be said."""
+        """Report `done` of `total`, where these are known."""
 
 
 @contextmanager
 def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
-    """A bar on stderr with what is being done, gone at the end; nothing where stderr is no terminal."""
+    """Show a bar on stderr with the current stage, removed at the end; nothing where stderr is no terminal."""
     console = rich.console.Console(stderr=True)
     columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -30,7 +30,7 @@ def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress
 
 @contextmanager
 def progress(stages: int) -> Iterator[Advance]:
-    """A progress bar over stages of work; a new name begins the next stage, and those before it are done."""
+    """Show a progress bar over stages of work; a new name begins the next stage and completes those before."""
     with _bar(rich.progress.TimeElapsedColumn()) as bar:
         task = bar.add_task("starting", total=stages)
         stage, begun = "", 0
@@ -46,7 +46,7 @@ def progress(stages: int) -> Iterator[Advance]:
 
 
 class Countdown:
-    """How long the rest will take, from the pace since every worker has done its first piece, which it compiled for."""
+    """Estimate of the remaining time, from the pace after each worker's first piece, which includes compilation."""
 
     def __init__(self, workers: int = 1, clock: Callable[[], float] = time.monotonic):
         self.workers, self.clock = workers, clock
@@ -56,7 +56,7 @@ class Countdown:
         self.last = (0, 0.0)
 
     def note(self, done: int) -> None:
-        """Take down how much is done now; called after each piece."""
+        """Record how much is done now; called after each piece."""
         self.last = done, self.clock()
         if self.first is None:
             self.first = done
@@ -66,7 +66,7 @@ class Countdown:
             self.warm = self.last
 
     def left(self, total: int) -> float | None:
-        """Seconds for the rest; None until every worker could do a second piece."""
+        """Return the remaining seconds; None until every worker could do a second piece."""
         if self.warm is None or self.pieces < 2 * self.workers:
             return None
         pace = (self.last[1] - self.warm[1]) / (self.last[0] - self.warm[0])
@@ -74,7 +74,7 @@ class Countdown:
 
 
 def spoken(seconds: float | None) -> str:
-    """A time that is left, as one says it."""
+    """Put a remaining time into words."""
     if seconds is None:
         return "time left unknown yet"
     for unit, size in (("h", 3600), ("min", 60)):
@@ -85,11 +85,12 @@ def spoken(seconds: float | None) -> str:
 
 @contextmanager
 def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on stderr with the time left, or a line each minute where stderr is no terminal.
+    """Show a bar on stderr with the time left, or print a line each minute where stderr is no terminal.
 
-    The callable takes what is being done, how much of it is done and how much there is; the countdown hears of it from
-    whoever knows what counts as a piece.
+    The context provides a function of (what is being done, how much is done, how much there is). The caller also has to
+    call `countdown.note`, since only it knows what a piece is.
     """
+    # Columns of the bar: count, elapsed time, remaining time.
     columns = (
         rich.progress.MofNCompleteColumn(),
         rich.progress.TimeElapsedColumn(),
@@ -101,6 +102,7 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
 
         def tell(what: str, done: int, total: int) -> None:
             nonlocal said
+            # Remaining time, once the countdown has a first piece.
             left = "" if countdown.first is None else spoken(countdown.left(total))
             bar.update(task, description=what, completed=done, total=total, left=left)
             if not bar.console.is_terminal and time.monotonic() - said >= LINE_EVERY:
@@ -112,13 +114,7 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def show_progress(what: str = "simulating") -> Iterator[Callable[[int, int], None]]:
-    """A progress bar with the time left, for `monte_carlo(..., progress=...)`.
-
-    The first chunk, which includes compilation, does not count for the estimate.
-
-    Raises:
-        ValueError: never; it only shows.
-    """
+    """Show a progress bar with the time left, for `monte_carlo(..., progress=...)`."""
     countdown = Countdown()
     countdown.note(0)
     with counting(countdown) as tell:

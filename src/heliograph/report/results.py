@@ -1,4 +1,4 @@
-"""A folder of results: computed under a progress bar, drawn, written, and there as a whole or not at all."""
+"""Folder of results: computed with a progress bar, plotted, and written as a whole or not at all."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypeVar
 from heliograph.disk.output_folder import check_replaceable, whole_folder
 from heliograph.report.progress import Advance, progress
 
-if TYPE_CHECKING:  # a missing extra is told by `write_results`, in one line
+if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line
     from matplotlib.figure import Figure
 
     from heliograph.report.page import Page
@@ -23,10 +23,13 @@ Json: TypeAlias = "str | float | bool | Sequence[Json] | Mapping[str, Json] | No
 
 @dataclass(frozen=True)
 class Results:
-    """What was found, as it is told.
+    """Results in the form in which they are written.
 
-    figures: by file name. page: the report, from every figure as SVG. summary: all numbers, as JSON has them.
-    write_data: writes what else belongs into the folder.
+    Attributes:
+        figures: figures by file name.
+        page: function from every figure as SVG to the report.
+        summary: all numbers, for JSON.
+        write_data: function that writes other files into the folder.
     """
 
     figures: "Mapping[str, Figure]"
@@ -38,10 +41,20 @@ class Results:
 def write_results(
     target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
 ) -> T:
-    """Compute in `stages` that the progress bar is told of, and write figures, report, data and summary to `target`.
+    """Compute, then write figures, report, data and summary to `target`.
 
-    The folder takes the place of earlier results, and of nothing else. `needs` are packages of extras beside those of
-    `report`: one that is missing is told before the work starts.
+    The folder replaces earlier results, and nothing else. A package that is missing is reported before the computation
+    starts.
+
+    Args:
+        target: the folder of results.
+        stages: number of stages of the computation, for the progress bar.
+        compute: the computation, called with the callback that announces a stage.
+        tell: function from what was computed to its results.
+        needs: packages of extras that are needed in addition to those of `report`.
+
+    Returns:
+        The value of `compute`.
 
     Raises:
         ValueError: a folder that cannot be written, or that holds something else.
@@ -60,7 +73,7 @@ def write_results(
 def report_results(
     target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
 ) -> None:
-    """As `write_results`, and print where the report is.
+    """Call `write_results`, and print the path of the report.
 
     Raises:
         ValueError: a folder that cannot be written, or that holds something else.

@@ -1,4 +1,4 @@
-"""A run over a recording as figures and a page: estimates with bands, innovations, links, and what is doubtful."""
+"""Report of a run over a recording: estimates with bands, innovations, links, and warnings."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -23,12 +23,12 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 
 def run_results(health: Health, network: str) -> Results:
-    """Everything that the folder holds; `network` is what the user calls it."""
+    """Return the content of the results folder; `network` is the user's name of the network."""
     return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
 
 
 def run_figures(health: Health) -> dict[str, Figure]:
-    """Estimates of each node, innovations of each filter, and when links delivered, by file name."""
+    """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
     drawn = {f"estimates_{i}": _estimates(health, health.record, node) for i, node in enumerate(_nodes(health.record))}
     later = health.record.smoothed
     if later is not None:
@@ -99,9 +99,10 @@ def _time_axis(health: Health, axes: Axes) -> None:
 
 
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
-    """The report; `drawings` holds each figure as SVG."""
+    """Return the report; `drawings` holds each figure as SVG."""
     record, doubts = health.record, health.warnings()
     arrived = np.mean([link.share for link in health.links]) if health.links else np.nan
+    # Three numbers to remember.
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
         KeyFigure(
@@ -109,12 +110,14 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         ),
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
+    # Filtered estimates, then smoothed ones if there are any.
     estimates = [
         Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                 f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each side{added}.")
         for kind, item, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
         for i, node in enumerate([] if item is None else _nodes(item))
     ]  # fmt: skip
+    # Warnings are in the title and in the first section.
     return Page(
         kicker="Heliograph run",
         title=f"{_counted(len(doubts), 'doubt')} about the network"
@@ -154,6 +157,7 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
 
 
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
+    # One row for each filter: size, correlation and p-value of its innovations.
     rows = []
     for filter_ in health.filters:
         test, name = filter_.test, visible(f"{filter_.node}/{filter_.filter}")
@@ -177,6 +181,7 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
         "such a correlation if there were none."
     )
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
+    # The innovations themselves, if any filter has some.
     picture = [Picture(drawings["innovations"], "Innovations over time in claimed deviations",
                        f"Innovations in claimed standard deviations, one colour a component; 5 of 100 may lie beyond "
                        f"±{BAND:g}.")
@@ -198,7 +203,7 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
 
 
 def run_summary(health: Health) -> dict[str, Json]:
-    """All numbers of the page, by node and filter, and by node and component."""
+    """Return all numbers of the report, by node and filter, and by node and component."""
     filters: dict[str, dict[str, Json]] = {}
     for filter_ in health.filters:
         results: dict[str, Json] = {"claim": filter_.claim}

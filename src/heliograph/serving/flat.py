@@ -1,4 +1,4 @@
-"""Trees of arrays as rows of doubles: what many plants know is one table, and what a plant knows a few of its rows."""
+"""Trees of arrays as rows of doubles, so that the states of many plants form one table."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from heliograph.numerics.types import PyTree
 
 
 class Flat(NamedTuple):
-    """The leaves of a tree side by side in a row; whole numbers keep their value up to 2^53."""
+    """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
 
     structure: jax.tree_util.PyTreeDef
     shapes: tuple[tuple[int, ...], ...]
@@ -22,7 +22,7 @@ class Flat(NamedTuple):
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def tree(self, row: jax.Array | np.ndarray) -> PyTree:
-        """The tree of a row."""
+        """Restore the tree from a row, with the shapes and dtypes of the original leaves."""
         parts, begin = [], 0
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             end = begin + int(np.prod(shape))
@@ -32,11 +32,11 @@ class Flat(NamedTuple):
 
 
 def flat_like(tree: PyTree) -> Flat:
-    """The layout of a tree of arrays."""
+    """Return the layout of a tree of arrays."""
     leaves, structure = jax.tree.flatten(tree)
     return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
 
 
 def row_of(tree: PyTree) -> jax.Array:
-    """A tree of arrays as a row."""
+    """Concatenate the leaves of a tree of arrays in a row of doubles."""
     return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])

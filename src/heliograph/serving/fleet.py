@@ -1,4 +1,4 @@
-"""Plants of one network: each takes its events as a timeline does; what is due is stepped for all of them at once."""
+"""Plants of one network: each takes its events as a timeline does; due rows are stepped for all plants at once."""
 
 from collections.abc import Iterable, Sequence
 from datetime import datetime
@@ -20,10 +20,13 @@ FAR = 10_000  # steps that an event may be after the newest one: each of them ha
 
 
 class Options(NamedTuple):
-    """What a fleet takes, and how much it holds.
+    """Limits of a fleet: which events it accepts, and how many rows it holds.
 
-    `window`: how late an event may be; `ahead`: how much later than its arrival its time may be; `leap`: how much
-    later than what arrived before; `capacity`: rows that a plant holds at most.
+    Args:
+        window: how late an event may be, in the unit of time of the network (default 10).
+        ahead: how much later than its arrival the time of an event may be (default 0).
+        leap: how much later than the newest arrival so far the time of an event may be (default unlimited).
+        capacity: greatest number of rows held for each plant (default 1000).
     """
 
     window: float = 10.0
@@ -33,7 +36,7 @@ class Options(NamedTuple):
 
 
 class Finalised(NamedTuple):
-    """A plant's rows that are final now, and its newest; `left`: slots to give back when these were read."""
+    """Rows of a plant that are final now, and its newest row; `left`: slots to free once these have been read."""
 
     plant: Plant
     final: list[HeldRow]
@@ -42,10 +45,14 @@ class Finalised(NamedTuple):
 
 
 class Fleet:
-    """Plants of one network: events are taken one after another, and `settle` steps what they left to be done.
+    """Plants of one network: events are taken one after another, and `step` computes the rows that they made due.
 
-    Estimates are those of a `Timeline` for each plant, with the same verdicts; the order of what is final is that
-    of time in each plant. Which plants share a fleet, and how events are cut into batches, changes no bit.
+    Estimates and verdicts are those of a `Timeline` for each plant; final rows come in order of time within each plant.
+    Which plants share a fleet, and how events are cut into batches, changes no bit of an estimate.
+
+    Args:
+        lanes: the compiled step of the network.
+        options: the limits of events and of memory.
     """
 
     def __init__(self, lanes: Lanes, options: Options):
@@ -54,20 +61,23 @@ class Fleet:
         network = self.network = lanes.network
         self.options, self.lanes = _checked(options), lanes
         self.pool = Pool(lanes)
+        # Columns of a row: the measurements of each node in turn, then the inputs.
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self.lanes.given
         sizes = [size for _, size in self._sizes.values()]
         self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
         self._width = self._places[-1].stop
+        # Last step for which the network is defined; limits of the jumps in time.
         covered = steps_covered(network)
         self._end = np.inf if covered is None else covered - 1
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
         self._joint = self.lanes.dt is None or network.common is not None
+        # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.start(self._blank, -1.0)
 
     def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
-        """A new plant, whose continuous time starts at `time`."""
+        """Add a plant, whose continuous time starts at `time`."""
         begun = -1.0 if self.lanes.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
@@ -76,24 +86,20 @@ class Fleet:
         return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
 
     def end(self, plant: Plant) -> None:
-        """Let go of a plant: its slots are free."""
+        """Remove a plant and free its slots."""
         self.pool.give([row.slot for row in plant.rows.held])
 
     def size(self, place: int) -> int:
-        """How many numbers an event of the node at this place has."""
+        """Return how many numbers an event of the node at this place has."""
         part = self._places[place]
         return part.stop - part.start
 
     def rows(self, base: HeldRow) -> Rows:
-        """Rows that begin with this one."""
+        """Return a chain of rows that begins with this one."""
         return Rows(base, self._joint, self._places, self.options.capacity)
 
     def known(self, node: str, sequence: int, time: float, values: list[float | None], arrival: float) -> Known:
-        """An event as numbers.
-
-        Raises:
-            ValueError: an unknown node, another number of values than the node's, a time that is no step.
-        """
+        """Convert an event to numbers."""
         place, size = self._sizes.get(node, (0, -1))
         if size < 0:
             raise fail("message, node", f"one of {', '.join(self._sizes)}", repr(node)[:60])
@@ -117,7 +123,7 @@ class Fleet:
         return verdict
 
     def undo(self, plant: Plant, now: float) -> None:
-        """Have a plant as it was before what it took since it was settled."""
+        """Restore a plant to its state before the events taken since the last call of `finalise`."""
         self.pool.give(plant.undo())
         plant.now = now
 
@@ -143,18 +149,19 @@ class Fleet:
     ) -> Float[np.ndarray, "plant outputs"]:
         """What the filters of each plant (None: one that has not begun) would tell with these inputs, NaN as they were.
 
-        After a step from the newest row, or over one unit of time, in which nothing is heard.
+        The prediction covers one step from the newest row, or one unit of continuous time. A plant that is None has not
+        begun yet. An input that is NaN keeps its value.
         """
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
         return self.pool.trial(np.array(slots), given, self._end)
 
     def outputs(self, slots: list[int]) -> list[list[float]]:
-        """What the filters told after the rows in these slots."""
+        """Return the outputs of the filters after the rows in these slots."""
         results: list[list[float]] = self.pool.table[slots, self.pool.outputs].tolist() if slots else []
         return results
 
     def forget(self, converged: Iterable[Finalised]) -> None:
-        """Give slots back, once what was told there is read."""
+        """Free the slots of these rows, once their outputs have been read."""
         for item in converged:
             self.pool.give(item.left)
 
@@ -169,7 +176,7 @@ Round = tuple[list[int], list[int], list[float]]  # slots to step from, slots to
 
 
 def _rounds(chains: Iterable[list[HeldRow]], by_steps: bool) -> list[Round]:
-    """The steps along each chain, those that come at the same turn together: at most one of each chain."""
+    """Group the steps of all chains by turn, so that each group has at most one step of each chain."""
     rounds: list[Round] = []
     for chain in chains:
         turn = 0

@@ -9,7 +9,7 @@ from heliograph.serving.lanes import Lanes, Place
 
 
 class Teller:
-    """Writes what a network's filters tell as lines; what is no finite number is null."""
+    """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
 
     def __init__(self, lanes: Lanes):
         self._n = len(lanes.network.states)
@@ -18,7 +18,7 @@ class Teller:
             self._nodes.setdefault(place.node, []).append(place)
 
     def estimates(self, kind: str, plant: str, time: float | str, outputs: list[float]) -> bytes:
-        """The filters' estimates after a row, from the numbers that they told there."""
+        """Return a line with the estimates of all filters after a row, from the outputs of that row."""
         results = {
             node: {place.filter: self._filter(place, outputs) for place in places}
             for node, places in self._nodes.items()
@@ -40,5 +40,5 @@ class Teller:
 
 
 def line(parts: dict[str, object]) -> bytes:
-    """One line of JSON, without its end."""
+    """Encode a value as one line of JSON, without the newline."""
     return to_json(parts, inf_nan_mode="null")

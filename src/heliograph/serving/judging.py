@@ -1,4 +1,4 @@
-"""Which events of a batch are implausible: those that no filter of their node could use."""
+"""Plausibility of the events of a batch: an event is implausible if no filter of its node could use it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
 class Candidate(NamedTuple):
-    """An event that was used, of the message with this number, and its row."""
+    """An event that was used, the number of its message, and its row."""
 
     message: int
     plant: Plant
@@ -27,7 +27,7 @@ class Candidate(NamedTuple):
 
 
 class Judges:
-    """Reads the filters' judgements of the rows that were just stepped."""
+    """Reader of the filters' judgements of the rows that were just stepped."""
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.lanes.places
@@ -41,23 +41,26 @@ class Judges:
     def implausible_inputs(
         self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
     ) -> list[str | None]:
-        """Why inputs are implausible, by the prediction over one step or one unit of time that they lead to."""
+        """Explain which inputs are implausible, by the prediction over one step or unit of time that they lead to."""
         if not plants:
             return []
         outputs = self.fleet.trial(plants, given)
         return [why_inputs(row[self._every]) for row in outputs]
 
     def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
-        """Why each of these is implausible, by its place among them, those that are.
+        """Return the indices of the implausible candidates, each with the reason.
 
-        Of a plant with inputs among these the first alone: what comes after it was judged with it. Of several events
-        of one node in one row the largest alone, since the row was judged as a whole; one without numbers never.
+        Of a plant with implausible inputs only the first of these is returned: what comes after it was judged with it.
+        Of several events of one node in one row only the largest is returned, since the row was judged as a whole; an
+        event without numbers never is.
         """
         if not taken:
             return {}
+        # Most rows raise no flag: look at the parts of a judgement only where one is raised.
         pool = self.fleet.pool
         outputs = pool.table[[item.row.slot for item in taken], pool.outputs]
         flagged = (outputs[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
+        # Reasons by candidate; by plant the first of its implausible inputs.
         result, spoilt = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
             item = taken[i]
@@ -68,6 +71,7 @@ class Judges:
                 spoilt[item.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
             if why:
                 result[i] = why
+        # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in result:
             place = taken[i].row.slot, taken[i].event.place
@@ -77,12 +81,12 @@ class Judges:
 
 
 def _size(event: Known) -> float:
-    """The largest number of an event, -1 where it has none."""
+    """Return the largest absolute number of an event, -1 if it has none."""
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
 def _columns(places: Sequence[Place]) -> np.ndarray:
-    """Where the judgements of these filters stand, (filter, part)."""
+    """Return the columns of the judgements of these filters, of shape (filter, part)."""
     results = [list(place.judgement) for place in places if place.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 

@@ -1,6 +1,7 @@
-"""Steps of many plants of one network: one compiled program, however many are due.
+"""Steps of many plants of one network: one compiled program, however many rows are due.
 
-So plants come and go without compiling, and no bit of an estimate depends on whose steps were taken beside it.
+Plants come and go without compilation, and no bit of an estimate depends on which other rows are stepped in the same
+call.
 """
 
 from functools import lru_cache, partial
@@ -28,7 +29,7 @@ WIDTH = 512  # lanes of one call
 
 
 class JudgementAt(NamedTuple):
-    """Where the parts of a judgement stand."""
+    """Columns of the parts of a judgement."""
 
     distance: int
     arrived: int
@@ -37,9 +38,9 @@ class JudgementAt(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a filter's estimate begins in what is told, its mean and its covariance, and the parts of its judgement.
+    """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 
-    `judgement` is None of a fusion, which hears nothing.
+    `judgement` is None for a fusion rule, which receives no measurement.
     """
 
     node: str
@@ -51,10 +52,16 @@ class Place(NamedTuple):
 
 
 class Lanes:
-    """A network's step as a function of rows: (state, heard, inputs, number of the step) to (state, told).
+    """A network's step as a function of rows: (state, received, inputs, step number) to (state, outputs).
 
-    `outputs` is the estimates' leaves, and each filter's judgement of what was heard; `places` says where. What a
-    filter finds implausible it leaves out.
+    The outputs are the leaves of the estimates and each filter's judgement of what it received; `places` gives their
+    columns. A filter leaves out the measurements that it finds implausible.
+
+    Args:
+        network: the network, with at least one filter.
+
+    Raises:
+        ValueError: no network, or one without filters.
     """
 
     def __init__(self, network: Network):
@@ -75,7 +82,7 @@ class Lanes:
         self._run = _program(static, self.state, self.outputs, self.received, self.inputs)
 
     def program(self) -> str:
-        """What is computed, as a text on which two processes agree."""
+        """Return the lowered program as text, which two processes compare to see that they compute the same."""
         with jax.enable_x64(True):
             text: str = self._run.lower(self._numbers, np.zeros((WIDTH, self._columns)), np.int32(0)).as_text()
         return text
@@ -85,7 +92,7 @@ class Lanes:
         return self.state.size + self.received + self.inputs + 1
 
     def step(self, rows: Float[np.ndarray, "lane column"]) -> Float[np.ndarray, "lane column"]:
-        """Step each row; (state, told) of each."""
+        """Step each row, WIDTH at a time; return (state, outputs) of each."""
         done = np.empty((len(rows), self.state.size + self.outputs.size))
         filled = np.zeros((WIDTH, self._columns))
         for begin in range(0, len(rows), WIDTH):
@@ -97,7 +104,7 @@ class Lanes:
         return done
 
     def _places(self) -> tuple[Place, ...]:
-        """Where each number is told: a row of the numbers of its columns is named as a row of estimates would be."""
+        """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
         result = jax.tree.map(lambda leaf: leaf.astype(int), self.outputs.tree(np.arange(float(self.outputs.size))))
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
@@ -110,7 +117,7 @@ class Lanes:
         )  # fmt: skip
 
     def _judged(self, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
-        """By node and filter where each part of a judgement stands."""
+        """Return the columns of each part of a judgement, by node and filter."""
         local = {"estimates": outcome["judged"], "fused": {}}
         parts = [by_name(self.network, local, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
         result = {
@@ -127,24 +134,28 @@ def _part(i: int, judged: PyTree) -> np.ndarray:
 
 @lru_cache
 def _program(static: Static, state: Flat, outputs: Flat, received: int, inputs: int) -> PyTree:
-    """(numbers, rows, turns) to rows: a loop over TOGETHER lanes, so that what is computed does not depend on turns."""
+    """Compile (numbers, rows, turns) to rows as a loop over TOGETHER lanes, so that results do not depend on turns."""
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
         item: NetworkStep = static.filled(numbers)
 
+        # A row is cut into (state, received, inputs, step number).
         def parts(row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
             known, rest = row[: state.size], row[state.size :]
             u, k = rest[received : received + inputs], rest[-1].astype(np.int64)
             return state.tree(known), rest[:received], u, k
 
+        # One step with all measurements, and whether a filter finds one of them implausible.
         def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
             after, result = item.judged(*parts(row))
             return jnp.concatenate([row_of(after), row_of(result)]), implausible(result)
 
+        # The step again, for each filter without the measurements that it finds implausible.
         def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
             first = state.tree(stepped[: state.size]), outputs.tree(stepped[state.size :])
             return jnp.concatenate([row_of(part) for part in item.without(first, *parts(row))])
 
+        # TOGETHER lanes at once; the second step is taken only if a lane needs it.
         def turn(i: jax.Array, done: jax.Array) -> jax.Array:
             some = jax.lax.dynamic_slice_in_dim(rows, i * TOGETHER, TOGETHER)
             stepped, bad = jax.vmap(judged)(some)

@@ -1,4 +1,4 @@
-"""The service at work: receive, take and commit, acknowledge, publish; until the end, or until it is told to stop."""
+"""The loop of a service: receive, take and commit, acknowledge, publish, until the end or a signal to stop."""
 
 import asyncio
 import signal
@@ -16,30 +16,41 @@ PATIENCE = (
 
 
 class Takes(Protocol):
-    """What a service is to the loop; it may be called from another thread, one call at a time."""
+    """A service as the loop sees it; it may be called from another thread, one call at a time."""
 
     def unpublished(self) -> list[Output]:
-        """What was committed before a restart and may not have been told."""
+        """Return outputs that were committed before a restart and may not have been published."""
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
-        """Use messages and commit; what is to be told of it."""
+        """Use messages and commit; return the outputs to publish."""
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """These were told: remembered with the next commit."""
+        """Note that these outputs were published; the next commit records it."""
 
     def finish(self, ended: bool) -> list[Output]:
-        """Commit all; what is left to tell, the last time. `ended`: there will be no more messages."""
+        """Commit everything; return the last outputs. `ended`: there will be no more messages."""
 
 
 async def keep_running(service: Takes, transport: Transport) -> None:
-    """Serve until the transport ends, or until SIGTERM or SIGINT: then what was received is committed and told."""
+    """Serve until the transport ends, or until SIGTERM or SIGINT; then commit and publish what was received.
+
+    Args:
+        service: the service, which takes messages and returns outputs.
+        transport: where messages come from and outputs go; it is closed at the end.
+    """
     stop = asyncio.Event()
     with signals(stop):
         await serve_until(stop, service, transport)
 
 
 async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport) -> None:
-    """Serve until the transport ends or until `stop`: then what was received is committed and told."""
+    """Serve until the transport ends or `stop` is set; then commit and publish what was received.
+
+    Args:
+        stop: event that ends the loop.
+        service: the service, which takes messages and returns outputs.
+        transport: where messages come from and outputs go; it is closed at the end.
+    """
     try:
         await _publish(service, transport, service.unpublished(), stop)
         ended = await _serve(service, transport, stop)
@@ -50,7 +61,7 @@ async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport)
 
 
 async def _serve(service: Takes, transport: Transport, stop: asyncio.Event) -> bool:
-    """Whether the transport ended."""
+    """Run the loop; return whether the transport ended."""
     while not stop.is_set():
         batch = await _unless(stop, transport.receive())
         if batch is None:
@@ -62,7 +73,7 @@ async def _serve(service: Takes, transport: Transport, stop: asyncio.Event) -> b
 
 
 async def _publish(service: Takes, transport: Transport, outputs: Sequence[Output], stop: asyncio.Event) -> None:
-    """Tell the outputs; once it is to stop a reader has PATIENCE, and what it leaves is told after a restart."""
+    """Publish outputs; after `stop` a reader has PATIENCE seconds, and the rest is published after a restart."""
     telling = asyncio.ensure_future(transport.publish(outputs))
     stopped = asyncio.ensure_future(stop.wait())
     await asyncio.wait({telling, stopped}, return_when=asyncio.FIRST_COMPLETED)
@@ -75,7 +86,7 @@ async def _publish(service: Takes, transport: Transport, outputs: Sequence[Outpu
 
 
 async def _unless(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
-    """What is waited for; None if it is to stop before."""
+    """Await a coroutine; cancel it and return None if `stop` is set first."""
     task, stopped = asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())
     await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)
     stopped.cancel()
@@ -89,7 +100,7 @@ async def _unless(stop: asyncio.Event, waiting: Coroutine[object, object, T]) ->
 
 @contextmanager
 def signals(stop: asyncio.Event) -> Iterator[None]:
-    """Have the signals to stop say so."""
+    """Set `stop` on SIGTERM and SIGINT, for the duration of a block."""
     loop, numbers = asyncio.get_running_loop(), (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]
     for number in numbers:

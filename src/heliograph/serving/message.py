@@ -1,4 +1,4 @@
-"""What comes in: one event of one plant, as JSON; its schema is the documentation that a sender needs."""
+"""Messages that a service receives: one event of one plant, as JSON; the schema is documentation for senders."""
 
 from datetime import datetime
 from shlex import quote
@@ -31,9 +31,18 @@ LONGEST = 1 << 20  # bytes of a message; what is longer is refused unread
 
 
 class Message(BaseModel):
-    """What a node of a plant measured, and the plant's inputs at that time, which may be left out.
+    """Measurements of a node of a plant at one time, and the plant's inputs at that time, which may be left out.
 
-    A node, its number there and a time name an event: sent again it is a duplicate and changes nothing.
+    A node, its count and a time identify an event: sent again it is a duplicate and changes nothing.
+
+    Args:
+        plant: name of the plant; a single plant needs none.
+        node: name of a node of the network, or "inputs", in which case `values` are the plant's inputs.
+        sequence: the node's running count of events, from 0; gaps are lost messages.
+        time: moment of the measurement: steps, seconds, or an ISO 8601 date with a time zone.
+        values: received values, one for each component; null did not arrive.
+        inputs: the plant's inputs without dt; null keeps its value.
+        arrival: moment of arrival; by default at once.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -51,10 +60,13 @@ _READER = TypeAdapter(Message)
 
 
 def read_message(payload: bytes) -> Message:
-    """The message in a line of JSON.
+    """Parse a message from a line of JSON.
+
+    Args:
+        payload: the line, of at most LONGEST bytes.
 
     Raises:
-        ValueError: what is no message; one line that names the part.
+        ValueError: no valid message; one line that names the part.
     """
     instance("message", payload, bytes, "bytes")
     if len(payload) > LONGEST:
@@ -72,11 +84,7 @@ def read_message(payload: bytes) -> Message:
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
-    """A time as a number: of dates the seconds since `origin`, exact to the microsecond before they are one.
-
-    Raises:
-        ValueError: a date where times are numbers, or a number where they are dates.
-    """
+    """Convert a time to a number: for dates the seconds since `origin`, exact to the microsecond before rounding."""
     mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):
         if origin is None:
@@ -88,5 +96,5 @@ def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> fl
 
 
 def schema() -> dict[str, object]:
-    """JSON schema of a message."""
+    """Return the JSON schema of a message."""
     return Message.model_json_schema()

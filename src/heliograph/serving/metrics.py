@@ -1,4 +1,4 @@
-"""What a service does, as Prometheus reads it."""
+"""Metrics of a service in the format of Prometheus."""
 
 from collections.abc import Iterable
 
@@ -11,14 +11,14 @@ from heliograph.serving.watch import Watch
 
 
 class Tallies(Collector):
-    """Numbers that a watch has when it is asked. By node and filter, not by plant, of which there may be many."""
+    """Collector of the numbers of a watch, by node and filter; not by plant, of which there may be many."""
 
     def __init__(self, watch: Watch):
         self.watch = watch
         watch.registry.register(self)
 
     def collect(self) -> Iterable[Metric]:
-        """As they are now."""
+        """Yield the current metrics."""
         yield from _links(self.watch)
         yield from _surprises(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
@@ -26,7 +26,7 @@ class Tallies(Collector):
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
 
     def text(self) -> bytes:
-        """All metrics, as text."""
+        """Return all metrics as text."""
         with self.watch.lock:
             return generate_latest(self.watch.registry)
 

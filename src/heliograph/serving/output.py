@@ -1,4 +1,4 @@
-"""What goes out: estimates, provisional and final, and what was refused."""
+"""Outputs of a service: estimates, provisional and final, and refusals."""
 
 from typing import Annotated, Literal, NamedTuple
 
@@ -10,7 +10,14 @@ Kind = Literal["provisional", "final", "refused"]
 
 
 class Output(NamedTuple):
-    """A line of JSON about a plant. `number` counts what is told exactly once; provisional estimates have none."""
+    """A line of JSON about a plant, to be published.
+
+    Args:
+        number: running count of the outputs that are published exactly once; None for provisional estimates.
+        plant: name of the plant.
+        kind: "provisional", "final" or "refused".
+        body: the line of JSON, without newline.
+    """
 
     number: int | None
     plant: str
@@ -19,7 +26,16 @@ class Output(NamedTuple):
 
 
 class FilterOutput(BaseModel):
-    """What one filter knows; null where a number is none."""
+    """Estimate of one filter; null stands for a number that is not finite.
+
+    Args:
+        mean: estimated state, n numbers.
+        covariance: n rows of n numbers; null if the filter claims no covariance.
+        claim: what the covariance is: exact, upper, nominal or none.
+        nis: normalised innovation squared of the received measurement; null if nothing was received.
+        received: number of received components, the expected value of `nis`.
+        implausible: reason why this filter alone did not use the measurement; empty if it did.
+    """
 
     mean: list[float | None]
     covariance: list[list[float | None]] | None = Field(description="Null of a filter that claims none.")
@@ -32,7 +48,15 @@ class FilterOutput(BaseModel):
 
 
 class Estimates(BaseModel):
-    """The filters of a plant after the row at `time`, by node and filter; those of several nodes under "fused"."""
+    """Estimates of a plant's filters after the row at `time`, by node and filter; fused ones under "fused".
+
+    Args:
+        id: running count of the final outputs of a store; null for provisional ones. A repeated output has the same.
+        kind: "provisional" estimates may still change by late measurements, "final" ones do not.
+        plant: name of the plant.
+        time: time of the row: steps, seconds or an ISO 8601 date.
+        estimates: the filters' estimates by node and filter.
+    """
 
     id: int | None = Field(
         None, description="Of final ones: counts what is published once; published again it is the same."
@@ -44,7 +68,18 @@ class Estimates(BaseModel):
 
 
 class Refused(BaseModel):
-    """What was refused, and why."""
+    """Refusal of a message, with the reason.
+
+    Args:
+        id: running count, shared with the final estimates.
+        kind: "refused".
+        plant: name of the plant; null, as the next three, if the message could not be read.
+        node: name of the node.
+        sequence: the node's count.
+        time: moment of the measurement.
+        reason: one of "duplicate", "conflict", "late", "future", "implausible", "malformed", "damaged".
+        detail: the reason in words.
+    """
 
     id: int
     kind: Literal["refused"]
@@ -60,5 +95,5 @@ AnyOutput = Annotated[Estimates | Refused, Field(discriminator="kind")]
 
 
 def schema() -> dict[str, object]:
-    """JSON schema of a line that is told."""
+    """Return the JSON schema of an output line."""
     return TypeAdapter(AnyOutput).json_schema()

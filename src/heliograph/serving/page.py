@@ -1,4 +1,4 @@
-"""The page to watch a service on, and its metrics, on one port: for this machine, or with a token for others."""
+"""Web page for watching a service, and its metrics, on one port: for this machine, or with a token for others."""
 
 import asyncio
 import hmac
@@ -39,7 +39,7 @@ POLICY = {
 
 
 class Door(NamedTuple):
-    """Where the page is, and the token that is asked for there (None: nobody else reaches it)."""
+    """Address of the page, and the token that is required there (None: only this machine can reach it)."""
 
     host: str
     port: int
@@ -50,7 +50,7 @@ def door(place: str, environment: Mapping[str, str] | None = None) -> Door:
     """`PORT`, of this machine alone, or `ADDRESS:PORT`, which takes a token from HELIOGRAPH_PAGE_TOKEN.
 
     Raises:
-        ValueError: no such place; one that others reach without a token of 16 characters at least.
+        ValueError: no such place; one that others can reach without a token of at least 16 characters.
     """
     host, _, port = place.rpartition(":")
     host = host.strip("[]") or "127.0.0.1"
@@ -72,9 +72,10 @@ def _is_loopback(host: str) -> bool:
 
 
 def application(watch: Watch, token: str | None) -> Starlette:
-    """The page at /, its data at /events, metrics at /metrics."""
+    """Return the web application: the page at /, its data at /events, metrics at /metrics."""
     tallies = Tallies(watch)
 
+    # The first view is written into the page; all others come from /events.
     def page(_: Request) -> Response:
         first = json.dumps(watch.view(None)).replace("<", "\\u003c")  # no name ends the element that it stands in
         return Response(_text("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
@@ -85,6 +86,7 @@ def application(watch: Watch, token: str | None) -> Starlette:
     def events(request: Request) -> Response:
         return StreamingResponse(_events(watch, request), media_type="text/event-stream")
 
+    # The token is checked for every route.
     middleware = [Middleware(Guarded, token)]
     if token is None:  # a page of elsewhere that names itself 127.0.0.1 does not get in
         middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK, www_redirect=False))
@@ -97,13 +99,13 @@ def _text(name: str) -> str:
 
 
 def file(request: Request) -> Response:
-    """A part of the page."""
+    """Serve a file of the page."""
     name = request.url.path.removeprefix("/")
     return Response(_text(name), media_type=KINDS[name], headers=POLICY)
 
 
 async def _events(watch: Watch, request: Request) -> AsyncIterator[str]:
-    """What is new, whenever something is; a comment else, so that a reader that went is noticed."""
+    """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
     plant, since, before = request.query_params.get("plant"), 0, None
     while not await request.is_disconnected():
         view = await asyncio.to_thread(watch.view, plant, since)
@@ -115,7 +117,7 @@ async def _events(watch: Watch, request: Request) -> AsyncIterator[str]:
 
 
 class Guarded:
-    """Lets in who brings the token: as `Authorization: Bearer`, or once as ?token=, which is then kept as a cookie."""
+    """Middleware that requires the token: as `Authorization: Bearer`, or once as ?token=, then kept as a cookie."""
 
     def __init__(self, app: ASGIApp, token: str | None):
         self.app, self.token = app, token
@@ -144,20 +146,20 @@ def _bearer(requested: HTTPConnection) -> str:
 
 
 class _Page(uvicorn.Server):
-    """Serves the page beside the service, which is the one that signals stop."""
+    """Web server next to a service; only the service handles signals."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """None: they stop the service, and with it the page."""
+        """Capture no signals: they stop the service, and with it the page."""
         yield
 
 
 @asynccontextmanager
 async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
-    """The page, as long as this lasts; the port that it is at.
+    """Serve the page for the duration of a block, which receives its port.
 
     Raises:
-        ValueError: a place that is taken, or not this machine's.
+        ValueError: an address that is taken, or not this machine's.
     """
     try:
         listener = socket.create_server((at.host, at.port), family=_family(at.host))

@@ -1,4 +1,4 @@
-"""One plant of a fleet: the rows it holds, the verdict on each message, and its links' tallies."""
+"""One plant of a fleet: its rows, the verdict on each message, and the counts of its links."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,10 +14,18 @@ from heliograph.numerics.types import Float
 
 @dataclass
 class Link:
-    """What came from a node: numbers of messages by verdict, and `lost`, the gaps in its counts that nothing filled.
+    """Counts of the messages of a node by verdict, and its running count, in which gaps are lost messages.
 
-    Counts run from `first` to `newest`, which was measured at `at`. A smaller number of a later time begins anew: the
-    node was started again. A larger one of an earlier time is from before that. `dropped`: single values beyond limits.
+    The running count of the node goes from `first` to `newest`, which was measured at time `at`. A smaller number with
+    a later time means that the node was restarted; a larger one with an earlier time is from before the restart.
+
+    Attributes:
+        first: smallest running count since the node's last start; -1 before the first message.
+        newest: greatest running count since then.
+        at: time of the measurement with the greatest count.
+        lost: gaps in the running count that no message has filled.
+        used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
+        dropped: single values beyond the limits of the node.
     """
 
     first: int = -1
@@ -33,14 +41,16 @@ class Link:
     dropped: int = 0
 
     def count(self, verdict: Verdict, sequence: int, time: float) -> None:
-        """Count one message. What is late, implausible or from the future came, whatever became of it."""
+        """Count one message. A late, implausible or future message was received too, so it fills a gap."""
         setattr(self, verdict, getattr(self, verdict) + 1)
         if verdict in ("duplicate", "conflict"):
             return
         if verdict in ("future", "implausible"):  # its time may be wrong: it says nothing of the order
             time = self.at
+        # First message, or the node was restarted: count from here.
         if self.newest < 0 or (sequence < self.newest and time > self.at):
             self.first, self.newest, self.at = sequence, sequence, time
+        # A gap above the newest count: its messages are lost, until they arrive.
         elif sequence > self.newest:
             if time >= self.at:
                 self.lost += sequence - self.newest - 1
@@ -55,7 +65,7 @@ class Link:
 
 
 class Change(NamedTuple):
-    """A row that took an event, and its numbers and events before; None: it was not there."""
+    """A row that took an event, with its numbers and events before; None if the row is new."""
 
     row: HeldRow
     before: tuple[Float[np.ndarray, " size"], dict[tuple[int, int, float], Float[np.ndarray, " values"]]] | None
@@ -63,11 +73,18 @@ class Change(NamedTuple):
 
 @dataclass
 class Plant:
-    """Rows held, of which those from `dirty` on have to be stepped anew.
+    """State of one plant: its rows, of which those from `dirty` on have to be stepped again.
 
-    `now` is the newest arrival; `forced`: rows that became final before their time, for want of room. `origin`: the
-    moment that its times are counted from, where they are dates. `version` counts its commits. `changes` since the last
-    events became settled can be undone.
+    Attributes:
+        name: name of the plant.
+        rows: the rows held, in order of time.
+        now: time of the newest arrival.
+        origin: date from which times are counted; None if times are numbers.
+        version: number of commits.
+        dirty: index of the first row to step again; None if all are up to date.
+        forced: number of rows that became final early, for lack of room.
+        links: counts of the messages, by node.
+        changes: changes since the last finalisation, for `undo`.
     """
 
     name: str
@@ -81,7 +98,7 @@ class Plant:
     changes: list["Change"] = field(default_factory=list)
 
     def take(self, event: Known, slot: Callable[[], int], width: int) -> None:
-        """Hold an event that is used, in a row of a slot if it begins one; what changes is remembered."""
+        """Add an event to its row, or to a new row in a slot of its own; record the change for `undo`."""
         place, row = self.rows.find(event)
         if row is None:
             row = HeldRow(self.rows.key(event), slot(), width)
@@ -93,7 +110,7 @@ class Plant:
         self.dirty = place if self.dirty is None else min(self.dirty, place)
 
     def undo(self) -> list[int]:
-        """Hold what was held before the last changes; slots that are free again. What was stepped is dirty."""
+        """Undo the recorded changes; return the slots that are free again. Rows that had been stepped become dirty."""
         slots = []
         for row, before in reversed(self.changes):
             if before is None:
@@ -107,20 +124,20 @@ class Plant:
         return slots
 
     def link(self, node: str) -> Link:
-        """The tally of a node."""
+        """Return the counts of a node."""
         result = self.links.get(node)
         if result is None:
             result = self.links[node] = Link()
         return result
 
     def chain(self) -> list[HeldRow]:
-        """The rows to step over again, after the one that they begin from."""
+        """Return the rows to step again, and before them the row from which they start."""
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None
         return chain
 
     def finalise(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
-        """The rows that are final once this is the watermark, and the slots that are not needed any more."""
+        """Make rows up to the watermark final; return them and the slots that are no longer needed."""
         self.changes = []
         base, forced = self.rows.finalise(watermark)
         if not base:

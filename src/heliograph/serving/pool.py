@@ -1,4 +1,4 @@
-"""The rows that all plants hold, in one table: what was heard, what the filters knew after it, what they told."""
+"""Table of the rows of all plants: received measurements, the filters' states after them, and their outputs."""
 
 import numpy as np
 
@@ -8,9 +8,10 @@ FEWEST = 1024  # rows of the table at first; it doubles when it is full
 
 
 class Pool:
-    """A row in each slot: (state, told, inputs held, step, heard, inputs given, time); slots are taken and given back.
+    """Table with one row per slot; slots are taken and given back.
 
-    `numbers` are the last columns, as a timeline's rows have them.
+    The columns are (state, outputs, inputs held, step number, received, inputs, time). `numbers` is the slice of the
+    last three, as in the rows of a timeline.
     """
 
     def __init__(self, lanes: Lanes):
@@ -24,11 +25,11 @@ class Pool:
 
     @property
     def used(self) -> int:
-        """How many slots are taken."""
+        """Return how many slots are taken."""
         return len(self.table) - len(self._free)
 
     def take(self) -> int:
-        """A slot of one's own."""
+        """Take a free slot."""
         if not self._free:
             count = len(self.table)
             self.table = np.concatenate([self.table, np.zeros_like(self.table)])
@@ -36,18 +37,22 @@ class Pool:
         return self._free.pop()
 
     def give(self, slots: list[int]) -> None:
-        """Slots that nobody needs any more."""
+        """Give slots back."""
         self._free += slots
 
     def start(self, slot: int, time: float) -> None:
-        """What is known before anything was heard."""
+        """Fill a slot with the prior, at `time`, before any measurement."""
         row = self.table[slot]
         row[:] = 0.0
         row[self.state], row[self.at], row[self.numbers] = self.lanes.start, -1.0, np.nan
         row[-1] = time
 
     def trial(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
-        """What is told a step, or a unit of time, after the rows in these slots, with these inputs and no data."""
+        """Predict from the rows in these slots, with these inputs and no measurement; return the outputs.
+
+        The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
+        number is at most `last`.
+        """
         lanes, table = self.lanes, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)
         u = u if lanes.dt is None else np.insert(u, lanes.dt, 1.0, axis=1)
@@ -57,9 +62,10 @@ class Pool:
         return done[:, lanes.state.size :]
 
     def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
-        """Step from the rows in these slots into others. `at`: the number of the step where time counts steps.
+        """Step from the rows in the slots `before` into those in `after`; `at`: the step number in discrete time.
 
-        There a row is stepped into as often as there are steps since the row before; it is heard at the last.
+        In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
+        received at the last of these.
         """
         lanes, table = self.lanes, self.table
         numbers, held = table[after, self.numbers], table[before, self.held]

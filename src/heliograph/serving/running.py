@@ -1,4 +1,4 @@
-"""A service by its options: what it reads from, where it keeps its state, who shares it, and who may look."""
+"""Assembly of a service from its settings: transport, store, sharing among processes, and the page."""
 
 import asyncio
 import os
@@ -31,8 +31,18 @@ LISTED = 10  # damaged plants in one line
 
 @dataclass(frozen=True)
 class ServiceSettings:
-    """What a service is to be; `parts`: how many parts of the plants several processes share among them;
-    `anew`: names of plants that begin anew.
+    """Settings of a service.
+
+    Args:
+        network: the network to run.
+        options: limits of events and memory.
+        store: path or URL of the database; None keeps no state.
+        process: name of this process among several.
+        snapshot: store whose plants a new store begins from.
+        broker: the broker; None reads standard input.
+        parts: number of parts of the plants that several processes share.
+        page: port, or address and port, of the page.
+        anew: names of plants that begin anew.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -63,9 +73,9 @@ class ServiceSettings:
 
 
 def store_of(network: str, given: str | None, parts: int | None) -> str | None:
-    """The place that keeps the state, as it was given; else a file here that is called as the network is.
+    """Return the place of the store as requested, else a file in this folder named after the network.
 
-    None keeps nothing. Processes that share parts must all be told where.
+    None keeps no state. Processes that share parts must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
@@ -93,7 +103,7 @@ Look = Callable[[Service], Takes]
 
 @asynccontextmanager
 async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
-    """Services as a page shows them, if there is one."""
+    """Wrap services for the page, if there is one."""
     if settings.page is None:
         yield lambda service: service
         return
@@ -106,7 +116,7 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 
 
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
-    """One process: all messages."""
+    """Serve all messages in one process."""
     stop = asyncio.Event()
     fleet = Fleet(lanes, settings.options)
     store = _open_store(settings, fleet)
@@ -123,7 +133,7 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
 
 
 def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
-    """Where the state is kept, with what it begins from."""
+    """Open the store, with the snapshot and the plants to begin anew, and report its state."""
     if settings.store is None:
         return InMemoryStore()
     from heliograph.serving.storage.store import Store
@@ -140,7 +150,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
 
 
 def report_damage(plants: Mapping[str, Damage]) -> str:
-    """What a user is told of plants that are damaged: their names, and whether these are as they were written."""
+    """Describe damaged plants to a user: their names, and whether a name itself was lost."""
     named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
     new = (
@@ -164,19 +174,22 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
     place, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked
     fleet = Fleet(lanes, settings.options)
+    # Check the store once, before any part is served.
     first = _open_store(settings, fleet)
     assert isinstance(first, Store)  # as Wanted checked
     first.close()
     mine = identity(fleet)
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        store = Store(place, mine, f"part {number} of {parts}", opened=first)  # who has it tells what it had to tell
+        # The journal of a part continues with whichever process serves it.
+        store = Store(place, mine, f"part {number} of {parts}", opened=first)
         try:
             service = look(Service(Fleet(lanes, settings.options), store, _say))
             await serve_until(stop, service, connected(broker, Part(number, parts)))
         finally:
             store.close()
 
+    # Lease parts under a name that is unique to this process.
     name = settings.process or f"{socket.gethostname()} {os.getpid()}"
     engine = engine_at(place)
     try:

@@ -1,4 +1,4 @@
-"""Whether a filter's claim and what it did not expect agree, as far as its last rows tell."""
+"""Running test of a filter's covariance by its NIS, over the last rows."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ from scipy.special import gammaincinv
 from heliograph.model.estimate import Claim
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
-FEWEST = 20  # numbers heard before anything is said
+FEWEST = 20  # received components before a test is made
 DOUBT = 0.001  # how often an honest filter is outside its band
 
 
 @dataclass
 class RunningNis:
-    """Normalised innovations squared, e' S^-1 e, of a filter at a node, weighted by w^age, w = 1 - 1/MEMORY.
+    """Exponentially weighted sum of NIS values, e' S^-1 e, of a filter at a node: weights w^age, w = 1 - 1/MEMORY.
 
-    If S is the truth each is chi-squared with as many degrees as numbers were heard: the weighted sum has mean
-    sum w m and variance sum w^2 2m. Divided by its mean it should be 1; its band is that of a gamma law with these
-    two moments (the chi-squared itself where all weights are 1).
+    If S is the true covariance each NIS is chi-squared with m degrees of freedom, the number of received components:
+    the weighted sum has mean sum w m and variance sum w^2 2m. Divided by its mean it should be 1; its band is that of a
+    gamma law with these two moments (the chi-squared law itself where all weights are 1).
     """
 
     claim: Claim
@@ -27,7 +27,7 @@ class RunningNis:
     numbers: int = 0
 
     def add(self, squared: float, received: int) -> None:
-        """Count a row."""
+        """Add the NIS of one row, with its degrees of freedom."""
         stored = 1 - 1 / MEMORY
         self.total = stored * self.total + squared
         self.mean = stored * self.mean + received
@@ -36,11 +36,11 @@ class RunningNis:
 
     @property
     def ratio(self) -> float:
-        """What was found over what is expected: honestly about 1."""
+        """Return the weighted sum over its expected value: about 1 if the covariance is right."""
         return self.total / self.mean if self.mean else float("nan")
 
     def band(self) -> tuple[float, float]:
-        """Where the ratio of an honest filter is, but for DOUBT of the time."""
+        """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right."""
         if not self.mean:
             return 0.0, float("inf")
         shape = self.mean**2 / self.variance
@@ -48,7 +48,7 @@ class RunningNis:
         return float(low), float(high)
 
     def doubt(self) -> str | None:
-        """Why the claim is not to be believed, if it is not."""
+        """Explain why the claim is doubtful, or return None."""
         low, high = self.band()
         if self.numbers < FEWEST:
             return None

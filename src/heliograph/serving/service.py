@@ -1,4 +1,4 @@
-"""The service: batches of messages in, what is to be told out; all that it knows is committed in between."""
+"""A service: batches of messages in, outputs to publish out; its whole state is committed in between."""
 
 import gc
 from collections import OrderedDict
@@ -19,7 +19,7 @@ from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
-ROWS = 200_000  # that are held in memory before plants which were not heard for long leave it for the store
+ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
 WHY: dict[Verdict, str] = {
     "duplicate": "held already",
     "conflict": "held already with other values, which stay",
@@ -30,9 +30,9 @@ WHY: dict[Verdict, str] = {
 
 
 class Taken(NamedTuple):
-    """What the last batch was: numbers of messages and outputs, and the seconds that it took in all and to commit.
+    """Statistics of the last batch: numbers of messages and outputs, and the seconds in all and for the commit.
 
-    `lag`: how long ago the oldest of its messages was measured, where they carry dates; else what it took.
+    `lag`: age in seconds of the oldest message, where messages carry dates; else the seconds that the batch took.
     """
 
     messages: int
@@ -43,26 +43,31 @@ class Taken(NamedTuple):
 
 
 class Service:
-    """A network's filters, for any number of plants, fed with messages in whatever order they come.
+    """A network's filters for any number of plants, fed with messages in whatever order they arrive.
 
-    It knows no transport: `take` uses a batch and gives what is to be told of it, after the commit. One call at a time.
-    `malformed` and `known` count messages that could not be read, and duplicates and late ones. `say` is called once,
-    with a line, when the first message is refused as implausible.
+    The service knows no transport: `take` uses a batch and returns the outputs to publish, after the commit. It is
+    called by one thread at a time. `malformed` counts messages that could not be read, `known` duplicates and late
+    ones.
+
+    Args:
+        fleet: the plants of the network.
+        store: where the state is committed.
+        say: called once with a line of text, when the first message is refused as implausible.
     """
 
     def __init__(self, fleet: Fleet, store: StoreProtocol, say: Callable[[str], None] | None = None):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
-        self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
+        self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
-        """Use messages, each a JSON object, and commit; what is to be told of it.
+        """Use messages, each a JSON object, and commit; return the outputs to publish.
 
-        Nothing in a message stops the service: what cannot be used is counted and told, with the reason.
+        Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
         """
         with _without_collection():
             return self._take(payloads)
@@ -71,6 +76,7 @@ class Service:
         begun = perf_counter()
         messages = [_read(payload) for payload in payloads]
         self._load({message.plant for message in messages if isinstance(message, Message)})
+        # If another process has committed one of the plants, read it again and repeat.
         while True:
             try:
                 outputs, committed = self._taken(messages, payloads)
@@ -78,6 +84,7 @@ class Service:
             except ConflictError:
                 self._load({message.plant for message in messages if isinstance(message, Message)})
         took = perf_counter() - begun
+        # Age of the oldest message.
         dates = [
             message.time for message in messages if isinstance(message, Message) and isinstance(message.time, datetime)
         ]
@@ -86,17 +93,17 @@ class Service:
         return outputs
 
     def unpublished(self) -> list[Output]:
-        """What was committed before a restart and may not have been told."""
+        """Return outputs that were committed before a restart and may not have been published."""
         return self.store.unpublished()
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """These were told: remembered with the next commit."""
+        """Note that these outputs were published; the next commit records it."""
         self._published = max(
             (output.number for output in outputs if output.number is not None), default=self._published
         )
 
     def finish(self, ended: bool) -> list[Output]:
-        """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
+        """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
         last = list(self.plants.values()) if ended and not self.store.keeps else []
         converged = self.fleet.finalise(last, all_=True)
         entries = self._finals(converged)
@@ -104,8 +111,9 @@ class Service:
         return self._commit({}, entries, 0)
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
-        """Use messages and commit; what is to be told, and how long the commit took."""
+        """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
+        # Messages of damaged plants are refused; all others are used.
         damage = [self._damage.get(m.plant) if isinstance(m, Message) else None for m in messages]
         outcomes = iter(self._using.use([m for m, why in zip(messages, damage, strict=True) if why is None]))
         for message, payload, damaged in zip(messages, payloads, damage, strict=True):
@@ -127,6 +135,7 @@ class Service:
             entries += [_refusal(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
+        # Step what is due; estimates of final rows are committed, provisional ones only published.
         converged = self.fleet.finalise(touched.values())
         entries += self._finals(converged)
         provisional = self._provisional([item for item in converged if item.plant.name in used])
@@ -139,7 +148,7 @@ class Service:
         return outputs + provisional, committed
 
     def _warn(self, message: Message, why: str) -> None:
-        """Say once that something is implausible."""
+        """Report the first implausible message, once."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
             what = f"message {message.sequence} of {message.node!r} {plant}is implausible"
@@ -147,7 +156,7 @@ class Service:
             self._say = None
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
-        """Keep what changed. If that fails, what is in memory of it is forgotten: the store is right."""
+        """Commit the changed plants. If that fails, forget them in memory: the store is authoritative."""
         stored = {}
         if self.store.keeps:
             stored = {
@@ -159,6 +168,7 @@ class Service:
             for name in touched:
                 self.fleet.end(self.plants.pop(name))
             raise
+        # After the commit: count versions, and let the plants with the oldest messages leave memory.
         self._published = None
         for name, plant in touched.items():
             plant.version += 1
@@ -168,7 +178,7 @@ class Service:
         return outputs
 
     def _load(self, names: Iterable[str]) -> None:
-        """Have the plants of these names in memory, where they are kept."""
+        """Load the plants of these names from the store, if it keeps any."""
         self._damage = {}
         for name, item in self.store.load([name for name in names if name not in self.plants]).items():
             if item.damage:
@@ -178,7 +188,7 @@ class Service:
             plant.version = item.version
 
     def _finals(self, converged: Iterable[Finalised]) -> list[Entry]:
-        """What is told once: the rows that are final now and in which something was heard."""
+        """Return final estimates, each published once: of rows that are final now and received a measurement."""
         rows = [(item.plant, row) for item in converged for row in item.final if row.observe()]
         outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [
@@ -187,7 +197,7 @@ class Service:
         ]
 
     def _provisional(self, converged: Sequence[Finalised]) -> list[Output]:
-        """What is known now."""
+        """Return the provisional estimates at the newest rows."""
         outputs = self.fleet.outputs([item.newest.slot for item in converged])
         return [
             Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
@@ -201,7 +211,7 @@ class Service:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """A batch makes many objects and no cycles: searching for some would take half of its time."""
+    """Pause garbage collection: a batch makes many objects and no cycles, and a search would take half its time."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -212,7 +222,7 @@ def _without_collection() -> Iterator[None]:
 
 
 def _read(payload: bytes) -> Message | str:
-    """The message, or why it is none."""
+    """Parse a message, or return the reason why it is malformed."""
     try:
         return read_message(payload)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""A process among several: it serves the parts of the plants that it leases, each with a service of its own."""
+"""Sharing of plants among processes: each serves the parts that it leases, with a service for each."""
 
 import asyncio
 import contextlib
@@ -14,39 +14,39 @@ Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 
 
 class Leased(Protocol):
-    """What says which parts are this process's."""
+    """Source of the parts that this process may serve."""
 
     term: float
 
     def renew(self) -> set[int]:
-        """Those that are."""
+        """Renew the leases; return the parts of this process."""
 
     def release(self, number: int) -> None:
-        """One that is not any more."""
+        """Release one part."""
 
     def leave(self) -> None:
-        """All."""
+        """Release all parts."""
 
 
 @dataclass
 class _Part:
-    """A part at work, and what ends it."""
+    """A part that is being served, and the event that ends it."""
 
     work: asyncio.Task[None]
     stop: asyncio.Event
 
     async def end(self) -> None:
-        """What was received is committed and told."""
+        """Stop the service of this part, after it has committed and published what it received."""
         self.stop.set()
         with contextlib.suppress(TakenOverError):
             await self.work
 
 
 async def keep_sharing(leases: Leased, serve: Serve) -> None:
-    """Serve the parts that are leased, until SIGTERM or SIGINT; `serve(part, stop)` serves one until `stop`.
+    """Serve the leased parts until SIGTERM or SIGINT; `serve(part, stop)` serves one until `stop` is set.
 
-    When a process joins, the others finish some of their parts and leave them to it. When one dies, its parts are
-    free after a term; who takes one over tells first what was committed and not told.
+    When a process joins, the others finish some of their parts and leave them to it. When one dies, its parts become
+    free after a term; whoever takes one over first publishes what was committed and not published.
     """
     stop = asyncio.Event()
     parts: dict[int, _Part] = {}
@@ -62,7 +62,8 @@ async def keep_sharing(leases: Leased, serve: Serve) -> None:
 
 
 async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None:
-    """Serve those parts that are leased now, and no others."""
+    """Start and stop services so that exactly the leased parts are served."""
+    # Parts whose service ended by itself: another process took them over, or it failed.
     for number, part in list(parts.items()):
         if part.work.done():
             del parts[number]
@@ -70,6 +71,7 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
                 part.work.result()
             except TakenOverError as error:
                 LOG.warning("%s", error)
+    # Stop those that are no longer leased, then release them; start the new ones.
     expected = await asyncio.to_thread(leases.renew)
     gone = [number for number in parts if number not in expected]
     await asyncio.gather(*[parts[number].end() for number in gone])

@@ -1,4 +1,4 @@
-"""The messages of a batch, used without what is implausible: its plants are put back, and take the rest again."""
+"""Use of a batch without its implausible messages: their plants are restored, and take the rest again."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ from heliograph.serving.plant import Link, Plant
 
 
 class Outcome(NamedTuple):
-    """What became of a message: its plant, None if it began none; a verdict, None if it could not be read; and why.
+    """Result of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason.
 
-    `notes`: what of a message that was used was not.
+    `notes`: parts of a used message that were left out.
     """
 
     plant: Plant | None
@@ -29,7 +29,7 @@ class Outcome(NamedTuple):
 
 
 class Before(NamedTuple):
-    """A plant before a batch: whether it was there, its time and its tallies."""
+    """State of a plant before a batch: whether it existed, its time and its counts."""
 
     known: bool
     now: float
@@ -37,7 +37,7 @@ class Before(NamedTuple):
 
 
 class Using:
-    """Gives messages to their plants. `plants` are those in memory, by name."""
+    """Distribution of messages to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, Plant]):
         self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
@@ -49,13 +49,14 @@ class Using:
         self._taken: list[Candidate] = []
 
     def use(self, messages: Sequence[Message | str]) -> list[Outcome]:
-        """What becomes of each message; those that are used are stepped.
+        """Give messages to their plants and step these; return the outcome of each message.
 
-        So the plants are as if what is refused as implausible had never come.
+        Afterwards the plants are as if the messages refused as implausible had never arrived.
         """
         self._refused = self._implausible_inputs(messages)
         outcomes: dict[int, Outcome] = {}
         left = list(range(len(messages)))
+        # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
         while left:
             self._before, self._taken = {}, []
             for i in left:
@@ -73,7 +74,7 @@ class Using:
         return [outcomes[i] for i in range(len(messages))]
 
     def _implausible_inputs(self, messages: Sequence[Message | str]) -> dict[tuple[int, bool], str]:
-        """The inputs that lead to no prediction, from what is known before the batch."""
+        """Return the inputs that lead to no valid prediction from the state before the batch."""
         given = [(i, message, message.values if message.node == INPUTS else message.inputs)
                  for i, message in enumerate(messages) if isinstance(message, Message)]  # fmt: skip
         given = [(i, item, values) for i, item, values in given if values and len(values) == self.fleet.lanes.given]
@@ -91,8 +92,9 @@ class Using:
             return Outcome(None, None, str(error))
 
     def _use(self, number: int, message: Message) -> Outcome:
-        """Give a message to its plant, which is None if it would have begun with one that is refused."""
+        """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
         plant = self.plants.get(message.plant)
+        # A new plant begins with a message that is plausible and of a right clock.
         origin = self._origin(message) if plant is None else plant.origin
         at = seconds(message.time, origin, message.plant)
         now = at if plant is None else plant.now
@@ -100,6 +102,7 @@ class Using:
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
+        # Values beyond limits do not count as received; an event of such values only is implausible.
         event, dropped, beyond = self._within(message.node, event)
         why = self._refused.get((number, event.place < 0)) or (beyond if np.isnan(event.values).all() else "")
         spoilt = self._refused.get((number, True)) if inputs is not None else None
@@ -113,6 +116,7 @@ class Using:
         elif plant.name not in self._before:
             links = {name: replace(link) for name, link in plant.links.items()}
             self._before[plant.name] = Before(True, plant.now, links)
+        # Inputs and measurement are used or refused independently.
         notes = []
         if inputs is not None and spoilt is None:
             self._take(number, plant, inputs)
@@ -135,7 +139,7 @@ class Using:
         return verdict
 
     def _within(self, node: str, event: Known) -> tuple[Known, int, str]:
-        """An event without what is beyond its node's limits: how many values these are, and which, in words."""
+        """Remove an event's values beyond the limits of its node; return how many these are, and which, in words."""
         limits = self._limits.get(node)
         if limits is None or not (outside := limits.outside(event.values)).any():
             return event, 0, ""
@@ -143,7 +147,7 @@ class Using:
         return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum()), said
 
     def _undo(self, name: str) -> None:
-        """Have a plant as it was before the batch."""
+        """Restore a plant to its state before the batch."""
         plant, (known, now, links) = self.plants[name], self._before[name]
         if known:
             self.fleet.undo(plant, now)
@@ -152,7 +156,7 @@ class Using:
             self.fleet.end(self.plants.pop(name))
 
     def _origin(self, message: Message) -> datetime | None:
-        """The midnight before a plant's first message, in UTC, where its times are dates."""
+        """Return midnight, UTC, before a plant's first message, if its times are dates and time is continuous."""
         if not isinstance(message.time, datetime) or self.fleet.lanes.dt is None:
             return None
         return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)

@@ -1,4 +1,4 @@
-"""What services do, for somebody who looks: estimates with their bands, links, tests, and what is doubtful."""
+"""Observation of running services: estimates with their bands, links, tests of covariances, and warnings."""
 
 import math
 import threading
@@ -15,7 +15,7 @@ from heliograph.serving.output import Output
 from heliograph.serving.running_nis import RunningNis
 
 T = TypeVar("T")
-PLANTS = 200  # plants whose estimates are remembered, those that were heard last
+PLANTS = 200  # plants with estimates in memory, those with the newest messages
 POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
@@ -23,7 +23,13 @@ LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0
 
 
 class Link(Protocol):
-    """Numbers of messages of a node: by verdict; `lost`: gaps in its counts; `dropped`: values beyond limits."""
+    """Counts of the messages of a node.
+
+    Attributes:
+        lost: gaps in the node's running count.
+        dropped: single values beyond limits.
+        used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
+    """
 
     lost: int
     dropped: int
@@ -36,49 +42,49 @@ class Link(Protocol):
 
 
 class Plant(Protocol):
-    """A plant's links, by node."""
+    """A plant as the page needs it."""
 
     @property
     def links(self) -> Mapping[str, Link]:
-        """By node."""
+        """Return the counts of the plant's links, by node."""
 
 
 class Taken(Protocol):
-    """What the last batch was."""
+    """Statistics of the last batch."""
 
     @property
     def took(self) -> float:
-        """Seconds, in all."""
+        """Return the seconds of the whole batch."""
 
     @property
     def committed(self) -> float:
-        """Seconds of it, to commit."""
+        """Return the seconds of the commit."""
 
     @property
     def lag(self) -> float:
-        """Seconds since the oldest message was measured, where that is known; else as many as it took."""
+        """Return the age of the oldest message in seconds, where it is dated; else the seconds of the batch."""
 
 
 class Serves(Takes, Protocol):
-    """A service as it is watched."""
+    """A service as the page needs it."""
 
     @property
     def plants(self) -> Mapping[str, Plant]:
-        """Plants in memory, by name."""
+        """Return the plants in memory, by name."""
 
     @property
     def malformed(self) -> int:
-        """Messages that could not be read."""
+        """Return the number of messages that could not be read."""
 
     @property
     def last(self) -> Taken:
-        """What the last batch was."""
+        """Return the statistics of the last batch."""
 
 
 class Point(NamedTuple):
-    """A plant's estimates at a time: by node and filter means and deviations. `number` counts the points.
+    """Estimates of a plant at one time: means and standard deviations by node and filter. `number` counts the points.
 
-    A final one comes after the provisional ones of its time, and takes their place.
+    A final point comes after the provisional ones of its time, and replaces them.
     """
 
     number: int
@@ -87,7 +93,7 @@ class Point(NamedTuple):
 
 
 class Watch:
-    """Looks at any number of services of one network; asked from another thread it waits for the batch at work."""
+    """Observer of any number of services of one network; a call from another thread waits for the current batch."""
 
     def __init__(self, states: Sequence[str]):
         self.states = list(states)
@@ -104,12 +110,12 @@ class Watch:
         self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
 
     def over(self, service: Serves) -> "Watched":
-        """The service, watched."""
+        """Wrap a service so that its batches are observed."""
         self.services.append(service)
         return Watched(service, self)
 
     def note(self, outputs: Sequence[Output], last: Taken) -> None:
-        """Remember what is worth a look."""
+        """Record the outputs and statistics of a batch."""
         self.took.observe(last.took)
         self.committed.observe(last.committed)
         self.lag.observe(last.lag)
@@ -139,22 +145,24 @@ class Watch:
         points.append(Point(self._count, message["time"], estimates))
 
     def plants(self) -> Iterator[tuple[str, Plant]]:
-        """All plants of all services."""
+        """Yield all plants of all services."""
         for service in self.services:
             yield from service.plants.items()
 
     def links(self) -> dict[str, dict[str, int]]:
-        """By node, over all plants: numbers of messages by verdict, lost ones, and values beyond limits."""
+        """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits."""
         return _added(plant for _, plant in self.plants())
 
     def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
-        """What the page shows of a plant (None: of the one heard last): estimates after the point `since`."""
+        """Return the data of the page for a plant (None: the one with the newest message), after the point `since`."""
         with self.lock:
+            # Plants by name may be in several services: counts are summed.
             name = next(reversed(self._points), "") if plant is None else plant
             results = [item for known, item in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests = self._tests.get(name, {})
             names = sorted(known for known, _ in self.plants())
+            # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
                 "count": len(names),
                 "plants": names[:LISTED],
@@ -188,34 +196,34 @@ class Watch:
 
 
 class Watched:
-    """A service that somebody looks at; to whoever runs it, it is the service."""
+    """A service whose batches are observed; the loop uses it like the service."""
 
     def __init__(self, service: Serves, watch: Watch):
         self.service, self.watch = service, watch
 
     def unpublished(self) -> list[Output]:
-        """As the service says."""
+        """Return the service's unpublished outputs."""
         return self.service.unpublished()
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
-        """As the service does, and remember what is worth a look."""
+        """Let the service take a batch, and record its outputs."""
         with self.watch.lock:
             outputs = self.service.take(payloads)
             self.watch.note(outputs, self.service.last)
         return outputs
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """As the service does."""
+        """Pass on that outputs were published."""
         self.service.published(outputs)
 
     def finish(self, ended: bool) -> list[Output]:
-        """As the service does."""
+        """Let the service commit everything."""
         with self.watch.lock:
             return self.service.finish(ended)
 
 
 def _newest(result: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
-    """What is kept of a plant, which is the newest now; the oldest goes."""
+    """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond PLANTS."""
     if plant not in result:
         result[plant] = make()
         if len(result) > PLANTS:
@@ -225,7 +233,7 @@ def _newest(result: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T
 
 
 def _band(message: Mapping[str, Any]) -> dict[str, object]:
-    """Means, and deviations where the filter claims any."""
+    """Return means, and standard deviations where the filter claims a covariance."""
     rows = message["covariance"]
     claimed = None if rows is None else [_root(row[i]) for i, row in enumerate(rows)]
     return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"]}
@@ -236,7 +244,7 @@ def _root(variance: float | None) -> float | None:
 
 
 def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
-    """Tallies of several plants, by node."""
+    """Sum the counts of several plants, by node."""
     results: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():

@@ -1,4 +1,4 @@
-"""Contract checks for your own channels, filters, quantizers and fusion rules; they raise AssertionError."""
+"""Contract tests for your own channels, filters, quantizers and fusion rules; they raise AssertionError."""
 
 import lazy_loader
 

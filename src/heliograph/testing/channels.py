@@ -1,4 +1,4 @@
-"""What a channel's moments must say: those of its samples."""
+"""Contract test of a channel: its moments must be those of its samples."""
 
 from itertools import product
 
@@ -17,12 +17,20 @@ FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all num
 def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: int = 20_000, highest: int = 4) -> float:
     """Compare a channel's samples with its joint moments, E[mono_k(z) | y] for k = 1 .. highest, at two points y.
 
-    Returns the largest |z| seen. Wrong moments of size s are found when s exceeds about 6 standard errors, so more
-    samples make it stricter. Of a map with modes two draws are taken one after the other: their moments are compared
-    under the modes' laws, and together E[H_1 x H_2] and E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a
-    wrong transition changes.
-    Of a map that remembers in a way of its own, which has no such moments, only `init` and `draw` are checked: a state
-    that keeps its structure and shapes.
+    Wrong moments are found when they differ by more than about 6 standard errors, so more samples make the test
+    stricter. Of a map with modes two draws are taken one after the other: their moments are compared under the laws of
+    the modes, and jointly E[H_1 x H_2] and E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a wrong
+    transition changes. A map with another kind of memory has no such moments; only `init` and `draw` are tested: a
+    state that keeps its structure and shapes.
+
+    Args:
+        channel: the channel to test.
+        seed: seed of the samples (default 0).
+        samples: number of samples (default 20,000).
+        highest: highest order of the moments (default 4).
+
+    Returns:
+        The largest |z|, a difference in units of its standard error.
 
     Raises:
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
@@ -30,6 +38,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
     generator = np.random.default_rng(seed)
     first, second = _drawn(channel, seed, samples)
     points = [channel.example_input(generator), channel.example_input(generator)]
+    # With modes: two successive draws, compared jointly.
     if channel.remembers:
         if not memories(channel):
             return 0.0
@@ -37,6 +46,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         now, later = (h[:, :-1] @ np.append(y, 1.0) for h, y in zip((first, second), points, strict=True))
         worst = _compare_lagged(modes, first[:, :-1], second[:, :-1])
         return max(worst, _compare_modes(modes, points, now, later, highest))
+    # Without memory: E[mono_k(z) | y], order by order.
     worst = 0.0
     for y in points:
         z = first[:, :-1] @ np.append(y, 1.0)
@@ -47,7 +57,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
 
 
 def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
-    """E[(G, n)_1 x (G, n)_2] of two draws in a row."""
+    """Compare E[(G, n)_1 x (G, n)_2] of two successive draws."""
     means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
     seen = np.einsum("sab,scd->sabcd", now, later)
@@ -57,7 +67,7 @@ def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> fl
 def _compare_modes(
     modes: JointModes, points: list[np.ndarray], now: np.ndarray, later: np.ndarray, highest: int
 ) -> float:
-    """Moments of two draws in a row, each and together."""
+    """Compare moments of two successive draws, each and jointly."""
     begin, rows, worst = np.asarray(modes.initial), np.asarray(modes.transition), 0.0
     given = {
         order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
@@ -73,7 +83,7 @@ def _compare_modes(
 
 
 def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and second draws of H, after the contract of `init`, `draw` and `sample` was checked."""
+    """Return first and second draws of H, after testing the contract of `init`, `draw` and `sample`."""
 
     def two_steps(key: jax.Array) -> object:
         start = channel.init(jax.random.fold_in(key, 2))
@@ -81,6 +91,7 @@ def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.n
         sampled = () if channel.remembers else channel.sample(key)
         return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1)), sampled
 
+    # Contract: a state of constant structure, and `draw` equal to `sample` without memory.
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(seed), samples)
         start, state, h, following, later, sampled = jax.jit(jax.vmap(two_steps))(keys)
@@ -89,6 +100,7 @@ def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.n
         assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
         same = channel.remembers or np.array_equal(h, sampled, equal_nan=True)
         assert same, "draw: expected what sample draws from the same key"
+    # Contract: H = [[G, n], [0, 1]].
     drawn = np.asarray(h)
     expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
     assert drawn.shape == expected_shape, f"draw: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"
@@ -103,7 +115,10 @@ def _monomials(z: np.ndarray, order: int) -> np.ndarray:
 
 
 def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
-    """Means over samples (sample, number) against what is expected; the largest ratio to the standard error."""
+    """Compare means over samples (sample, number) with expected ones; return the largest |difference| / standard error.
+
+    The standard error is that of each mean.
+    """
     error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)
     scale = np.abs(seen).max(axis=0) + np.abs(expected)

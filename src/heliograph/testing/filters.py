@@ -1,4 +1,4 @@
-"""What a filter must keep: its sizes, its claim, and that a step is its prediction and its correction."""
+"""Contract test of a filter: sizes, claim, and a step that is its prediction and its correction."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,16 +20,23 @@ ROUNDING = 1e-9  # relative: far above what a few operations lose, far below wha
 def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
     """Check the contract of a filter on random measurements, with the same inputs at each step.
 
-    Its claim and sizes are stated, and a measurement or input of another size is refused. A step is its prediction and
-    correction; is deterministic; leaves the structure of the state alone; gives a finite mean and a symmetric positive
-    semidefinite covariance (NaN if it claims none), also when some or all components are missing; and does the same
-    inside vmap. An innovation is NaN where a component is missing; its log-likelihood is finite unless no covariance
-    is claimed, 0 where nothing arrived, and `log_likelihood` of a run is the sum.
+    Claim and sizes are stated, and a measurement or input of another size is refused. A step equals prediction and
+    correction; is deterministic; preserves the structure of the state; returns a finite mean and a symmetric positive
+    semidefinite covariance (NaN if it claims none), also if some or all components are missing; and does the same
+    inside vmap. An innovation is NaN where a component is missing; its log-likelihood is finite unless no covariance is
+    claimed, 0 if nothing arrived, and `log_likelihood` of a run is the sum.
+
+    Args:
+        item: the filter to test.
+        inputs: the plant's inputs, shape (inputs,); by default none.
+        steps: number of steps (default 5).
+        seed: seed of the measurements (default 0).
 
     Raises:
-        AssertionError: naming what does not hold.
+        AssertionError: naming the rule that is broken.
     """
     _check_sizes(item, inputs)
+    # Measurements: the first complete, then some components missing, the last with all missing.
     data = np.random.default_rng(seed).normal(size=(steps, item.received))
     data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < 0.3] = np.nan
     data[-1] = np.nan
@@ -37,6 +44,7 @@ def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, s
     state, total = item.init(), 0.0
     structure = str(jax.tree.structure(state))
     for k, z in enumerate(data):
+        # Each step twice: determinism, structure, estimate, prediction + correction, vmap.
         seen, again = _seen(item, state, z, u[k], k), _seen(item, state, z, u[k], k)
         (following, estimate), (corrected, innovation) = seen.step, seen.correction
         assert np.array_equal(estimate.mean, again.step[1].mean), (
@@ -51,13 +59,14 @@ def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, s
         scale = 1 + np.abs(estimate.mean).max()
         assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
         state, total = following, total + float(innovation.log_likelihood)
+    # log p(z_1, ..., z_N) = sum of the innovations' log-likelihoods.
     whole = float(log_likelihood(item, data, u))
     same = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
     assert same, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
 
 
 class Seen(NamedTuple):
-    """What a filter makes of one step: at once, by its parts, and the means of two such steps in one vmap."""
+    """Results of one step: of the step itself, of its parts, and the means of two such steps in one vmap."""
 
     step: tuple[PyTree, Estimate]
     correction: tuple[PyTree, Innovation]
@@ -75,6 +84,7 @@ def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
     assert item.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {item.claim!r}"
     assert item.states and len(set(item.states)) == len(item.states), "states: expected distinct names"
     assert item.received >= 0, "received: expected a length"
+    # Calls with wrong sizes or infinite values, each with the name that the error must begin with.
     state, fitting = item.init(), np.zeros(item.received)
     wrong: list[tuple[str, Callable[[], object]]] = [
         ("inputs", lambda: item.predict(state, np.zeros(len(item.inputs) + 1)))

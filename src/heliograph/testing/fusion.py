@@ -1,4 +1,4 @@
-"""What a fusion rule must keep: identical estimates, claims, and a bound that is one."""
+"""Contract test of a fusion rule: identical estimates, claims, and the bound on the fused covariance."""
 
 import numpy as np
 
@@ -11,14 +11,20 @@ SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for 
 
 
 def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0) -> None:
-    """Check a rule on random estimates, `count` of them with n components.
+    """Check a fusion rule on random estimates.
 
-    Identical estimates give themselves back; a claim is no stronger than the weakest input's; fusing inside vmap is
-    fusing alone; and where "upper" is claimed, the bound dominates the fused error's covariance for random joint
-    covariances of the inputs' errors.
+    Identical estimates are returned unchanged; a claim is no stronger than the weakest input's; fusion inside vmap
+    equals fusion alone; and where "upper" is claimed, the fused covariance dominates that of the fused error for random
+    joint covariances of the inputs' errors.
+
+    Args:
+        rule: the rule to test.
+        count: number of estimates (default 3).
+        n: number of states (default 2).
+        seed: seed of the covariances (default 0).
 
     Raises:
-        AssertionError: naming what does not hold.
+        AssertionError: naming the rule that is broken.
     """
     generator = np.random.default_rng(seed)
     claims: list[Claim] = ["exact", "upper", "nominal"]

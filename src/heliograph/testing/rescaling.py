@@ -1,4 +1,4 @@
-"""The same filters in other units: every state, output, measurement and input multiplied by a factor of its own."""
+"""Filters in other units: every state, output, measurement and input multiplied by a factor of its own."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,7 +37,7 @@ Modes = TypeVar("Modes", SideInformation, ObservationModel)  # a channel at one 
 
 
 class InUnits(Module):
-    """A function of vectors, in other units: out f(x / into_1, ...). Functions in whatever units are one program."""
+    """A function of vectors in other units: out f(x / into_1, ...). Functions in all units share one program."""
 
     function: Callable[..., ArrayLike]
     out: np.ndarray
@@ -50,7 +50,7 @@ class InUnits(Module):
 
 
 class Units(NamedTuple):
-    """Factors of the states (n,), of a sensor's outputs (p,), of what arrives (m,) and of the inputs."""
+    """Factors of the states (n,), of a sensor's outputs (p,), of the measurement (m,) and of the inputs."""
 
     states: Float[np.ndarray, " n"]
     outputs: Float[np.ndarray, " p"]
@@ -59,12 +59,13 @@ class Units(NamedTuple):
 
 
 def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
-    """The filter that has the estimate S xhat where this one, given z and u, has xhat, and that one Q z and U u.
+    """Return the filter with estimate S xhat from Q z and U u, where `item` has xhat from z and u.
 
     Raises:
-        ValueError: a filter of a kind that this does not know.
+        ValueError: a filter of an unknown kind.
     """
     s = units.states
+    # x -> S x: mean S m, covariance S P S; plant, sensor and channel in the new units.
     match item:
         case GaussianFilter():
             return replace(
@@ -91,6 +92,7 @@ def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
             )
         case PolynomialFilter(inner=LinearSystemFilter()):
             assert isinstance(item.inner, LinearSystemFilter)
+            # A filter of products x x' ...: its monomials are scaled by products of the factors.
             inner = _system(item.inner, item.degree, units)
             return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
         case ModalFilter() | UncertainModalFilter():
@@ -113,7 +115,7 @@ def _gaussian(item: AbstractFilter) -> GaussianFilter:
 
 
 def _in_turn(item: SequentialFilter, units: Units) -> list[AbstractFilter]:
-    """Each part with its own outputs and measurements, which stand in `units` one after the other."""
+    """Split into parts, each with its own outputs and measurements, which follow one another in `units`."""
     result, received, said = [], 0, 0
     for part in item.filters:
         m, p = part.received, len(first(part.sensor).outputs)
@@ -130,7 +132,7 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
 
 
 def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
-    """The plant of S x, given U u."""
+    """Return the plant of S x, with inputs U u."""
     if isinstance(item, OverTime):
         return over_time([rescaled_plant(single, units) for single in unstack(item)])
     s, u = units.states, units.inputs
@@ -147,7 +149,7 @@ def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
 
 
 def rescaled_sensor(item: AnySensor, units: Units) -> AnySensor:
-    """The sensor that measures R y of S x."""
+    """Return the sensor that measures R y of S x."""
     if isinstance(item, OverTime):
         return over_time([rescaled_sensor(single, units) for single in unstack(item)])
     s, r = units.states, units.outputs
@@ -163,7 +165,7 @@ def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTi
 
 
 def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
-    """The description of z = Q G R^-1 y + Q n."""
+    """Return the description of z = Q G R^-1 y + Q n."""
     q, (_, factor) = units.received, _of_channel(units)
 
     def scaled(part: QuadraticMap) -> QuadraticMap:
@@ -175,13 +177,13 @@ def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
 
 
 def _of_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
-    """Factors of (G, n) and of a tensor of second moments."""
+    """Return factors of (G, n) and of a tensor of second moments."""
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 
 
 def _by_mode(item: Modes | OverTime, units: Units) -> Modes | OverTime:
-    """The description of z = Q G R^-1 y + Q n for each mode."""
+    """Return the description of z = Q G R^-1 y + Q n for each mode."""
     values: Modes = item.values if isinstance(item, OverTime) else item
     of_mean, of_spread = _of_channel(units)
     scaled: Modes = replace(values, mean=of_mean * values.mean, spread=of_spread * values.spread)
@@ -232,6 +234,6 @@ def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystem
 
 
 def _powers(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
-    """Factors of the monomials up to `degree`."""
+    """Return factors of the monomials up to `degree`."""
     table = np.array(exponents(len(factors) + 1, degree))[:-1, :-1]
     return np.asarray(np.prod(factors**table, axis=1))

@@ -1,4 +1,4 @@
-"""Whether the answers of a network depend on the user's units."""
+"""Test that the estimates of a network do not depend on the user's units."""
 
 from collections.abc import Callable
 
@@ -35,15 +35,23 @@ MISSING = 0.2  # share of the components that do not arrive
 def check_scaling(
     network: Network, inputs: ArrayLike | None = None, steps: int = 5, seed: int = 0, trials: int = 1
 ) -> float:
-    """Give every state, output, measurement and input of a network a unit of its own, and compare all estimates.
+    """Rescale every state, output, measurement and input of a network, and compare all estimates.
 
-    Factors from 1e-9 to 1e9 are drawn for each; every filter is told the model in the new units and hears the same
-    simulated measurements, some missing. Means and covariances must agree to 1e-8 of each component's own scale. A rule
-    that minimises a trace (covariance intersection, a bound with free scalars) adds squares of different units by
-    definition: with it all states get one factor, and the weights that it searches for agree to 1e-6. So do the
-    descriptions of the channels that filters are made from. Returns the largest difference, in its allowance.
+    Factors from 1e-9 to 1e9 are drawn for each; every filter gets the model in the new units and the same simulated
+    measurements, some missing. Means and covariances must agree to 1e-8 of each component's own scale. A rule that
+    minimises a trace (covariance intersection, a bound with free scalars) adds squares of different units by
+    definition: for it all states get one factor, and the weights that it optimises agree to 1e-6. The same holds for
+    the descriptions of the channels that filters are made from.
 
-    Shapes: inputs (steps, inputs).
+    Args:
+        network: the network to test.
+        inputs: the plant's inputs, shape (steps, inputs); by default none.
+        steps: number of steps (default 5).
+        seed: seed of the measurements and factors (default 0).
+        trials: number of draws of the factors (default 1).
+
+    Returns:
+        The largest difference, relative to its tolerance.
 
     Raises:
         AssertionError: naming the node, the filter and the step; an estimate that is not finite.
@@ -64,7 +72,7 @@ def check_scaling(
 
 
 def _nodes(network: Network) -> dict[str, Node]:
-    """The nodes, all of which hear the plant themselves."""
+    """Return the nodes, all of which must measure the plant themselves."""
     results = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(results) < len(network.nodes):
         raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
@@ -72,14 +80,14 @@ def _nodes(network: Network) -> dict[str, Node]:
 
 
 def _unreceived(network: Network) -> Network:
-    """The network without its filters, of which what is measured does not depend, unless a sensor hears back."""
+    """Return the network without its filters, except where a filter feeds back to its sensor."""
     published = {name: node.informed_by is not None for name, node in _nodes(network).items()}
     nodes = {n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
     return Network(network.plant, nodes)
 
 
 def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
-    """Units of each node, and of all nodes together under the name of what is fused."""
+    """Draw units of each node, and of all nodes together under the name of fusion."""
 
     def factors(count: int) -> np.ndarray:
         return np.asarray(10.0 ** random.uniform(-DECADES, DECADES, size=count))
@@ -124,7 +132,7 @@ def _judged(name: str, differences: np.ndarray) -> float:
 
 
 def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
-    """Largest difference at each step, of each component's own scale: its mean and the largest deviation claimed."""
+    """Return the largest difference at each step, relative to a component's scale: its mean and greatest deviation."""
     mean, other = np.asarray(a.mean), np.asarray(b.mean) / s
     covariance, their = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
     claimed = a.claim != "none"
@@ -151,14 +159,14 @@ def _node(name: str, node: Node, units: Units) -> Node:
 
 
 def _between(channel: Channel, units: Units) -> Channel:
-    """The channel that has Q z where this one, given y, has z, and that one R y."""
+    """Return the channel that maps R y to Q z, where this one maps y to z."""
     if isinstance(channel, OverTime):
         return over_time([_between(item, units) for item in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 
 def _apart(a: SecondOrder, b: SecondOrder) -> float:
-    """Largest difference of two descriptions, of each entry's own scale: two reaches of z_i times two of y_a."""
+    """Return the largest difference of two descriptions, relative to each entry's scale."""
     items: list[Callable[[SecondOrder], np.ndarray]] = [
         lambda d: _ends(d.spread), lambda d: _ends(d.shift), lambda d: _ends(d.power), lambda d: _ends(d.nominal)
     ]  # fmt: skip
@@ -182,7 +190,7 @@ def _fused(name: str, item: Fusion | AbstractFilter, units: Units) -> Fusion | A
 
 
 def _searches(network: Network, node: str, name: str) -> bool:
-    """Whether a trace is minimised somewhere on the way to this estimate."""
+    """Return whether a trace is minimised on the way to this estimate."""
     if node != FUSED:
         return _minimises(network.nodes[node].filters[name])
     item = network.fused[name]

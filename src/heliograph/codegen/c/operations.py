@@ -1,4 +1,4 @@
-"""Scalar operations as expressions of C99: each operation of the graph, and numbers as literals."""
+"""Scalar operations and literals as expressions of C99."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -38,22 +38,23 @@ WHOLE: dict[str, Callable[..., str]] = {
 
 
 def c_type(type: Type, real: Real) -> str:
-    """The type in C of a number in the program."""
+    """Return the C type of a number in the program."""
     names = {"f64": real, "bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}
     return names[type]
 
 
 def literal(value: float | int | bool, type: Type, real: Real) -> str:
-    """A known number; every digit that its type holds.
+    """Return a known number as a literal with every digit that its type has.
 
     Raises:
-        ValueError: a number beyond those of single precision.
+        ValueError: a number beyond the range of single precision.
     """
     if type == "bool":
         return "1" if value else "0"
     if type != "f64":
         text = f"{int(value)}{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
         return f"({text})" if value < 0 else text
+    # Floating-point numbers: the shortest text that reads back as the same number.
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):
@@ -70,10 +71,10 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
 
 
 def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
-    """An operation on names and literals.
+    """Return an operation on names and literals.
 
     Raises:
-        Unsupported: an operation that C has not.
+        Unsupported: an operation that C does not have.
     """
     op, whole = node.op, node.type != "f64"
     if op == "convert":
@@ -82,6 +83,7 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
         return f"({c_type(node.type, real)}){arguments[0]}"
     if op == "not":
         return f"!{arguments[0]}" if node.type == "bool" else f"~{arguments[0]}"
+    # Integers first, since C's operators differ from those of floating-point numbers.
     if whole and op in WHOLE:
         return WHOLE[op](*arguments)
     if op in COMPOSED:

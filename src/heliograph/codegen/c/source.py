@@ -1,4 +1,4 @@
-"""A graph as statements of C99: one number, one local variable; loops and guarded blocks as they are."""
+"""Graphs as statements of C99: a local variable for each number, loops and guarded blocks as in the graph."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -13,9 +13,9 @@ Place = Callable[[str], str]  # from an index to what stands there
 
 
 class CSource:
-    """Statements for what some nodes need, and the tables that they read.
+    """Statements that compute some nodes, and the tables that they read.
 
-    `places`: where the numbers of each input lie. `prefix`: what the names of tables begin with.
+    `places`: expressions of the numbers of each input. `prefix`: prefix of the names of tables.
     """
 
     def __init__(self, roots: Iterable[Node], places: Mapping[Buffer, Place], real: Real, prefix: str):
@@ -28,13 +28,14 @@ class CSource:
         self.count = 0
 
     def name(self, node: Node) -> str:
-        """What stands for a number."""
+        """Return the variable or literal of a number."""
         return literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def statements(self, block: Block, indent: str = "    ") -> list[str]:
-        """A block's statements, in its order."""
+        """Return a block's statements, in order."""
         lines: list[str] = []
         for item in block.items:
+            # Only what is needed; the end of a loop always is.
             if item not in self.needed and not isinstance(item, Check):
                 continue
             if isinstance(item, Node):
@@ -53,12 +54,12 @@ class CSource:
         return lines
 
     def declarations(self, indent: str = "    ") -> list[str]:
-        """The arrays that the statements fill."""
+        """Declare the arrays that the statements fill."""
         arrays = self.arrays.items()
         return [f"{indent}{c_type(b.type, self.real)} {name}[{max(b.size, 1)}];" for b, name in arrays]
 
     def table_definitions(self) -> list[str]:
-        """The tables, a definition each."""
+        """Define the tables, one definition each."""
         return [text for _, text in self.tables.values()]
 
     def _new(self) -> str:
@@ -81,7 +82,7 @@ class CSource:
         return self._entry(buffer, offset, strides, node.args)
 
     def _entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
-        """A number in memory, which may lie in that of another array."""
+        """Return the expression of a number in memory, which may be part of another array."""
         whole, start = buffer.owner
         index = self._at(start + offset, strides, indices)
         if whole.table is not None:
@@ -106,7 +107,7 @@ class CSource:
         return self.tables[key][0]
 
     def _loop(self, loop: Loop, indent: str) -> list[str]:
-        """Variables carry what the body computes from turn to turn."""
+        """Write a loop, with variables that carry numbers from turn to turn."""
         deeper, lines = f"{indent}    ", []
         carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed]
         for place in carried:
@@ -132,7 +133,7 @@ class CSource:
         return [*lines, f"{indent}}}"]
 
     def _guard(self, guard: Guard, indent: str) -> list[str]:
-        """Zeros where the condition does not hold."""
+        """Write a guarded block; its results are zero if the condition does not hold."""
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
         lines = []
         for result, _ in results:

@@ -1,4 +1,4 @@
-"""Text of LLVM IR as code of this machine."""
+"""Compilation of LLVM IR to code of this machine."""
 
 import ctypes
 from collections.abc import Callable
@@ -13,7 +13,7 @@ SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_in
 
 @cache
 def target() -> llvm.Target:
-    """This machine's."""
+    """Return the LLVM target of this machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple()
@@ -21,16 +21,16 @@ def target() -> llvm.Target:
 
 @cache
 def features() -> tuple[str, str, bool]:
-    """This processor's name and features for LLVM, and whether it fuses products and sums."""
+    """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
     result = llvm.get_host_cpu_features()
     arm = "aarch64" in target().triple or "arm64" in target().triple
     return llvm.get_host_cpu_name(), result.flatten(), bool(result.get("fma")) or arm
 
 
 class Machine:
-    """Code of one text; the function `run` in it may be called as long as this is held.
+    """Code of one text; its function `run` may be called as long as this object exists.
 
-    LLVM's passes over the text find nothing more in straight lines, and take as long as making code of them.
+    LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
     """
 
     def __init__(self, text: str):

@@ -1,4 +1,4 @@
-"""The functions of a compiled program as text, and where its numbers lie in memory."""
+"""Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -27,11 +27,11 @@ LINE = 64  # bytes: where vectors of any width may start
 
 
 class Code(NamedTuple):
-    """Text of the two functions, and what they are called with.
+    """Text of the two functions, and their arguments.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
-    `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` stand in the program,
-    and a block takes `work` of them, each turn of its loops counted.
+    `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
+    program; a block executes `work` of them, with each turn of its loops.
     """
 
     blocks: str
@@ -47,10 +47,7 @@ class Code(NamedTuple):
 
 
 def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
-    """Have a program store its results: each in a buffer of its own.
-
-    Those of these numbers `last`, after everything else is computed, so that they may lie where arguments did.
-    """
+    """Store the results of a program, each in a buffer of its own."""
     lowering = Lowering()
     lowering.graph = program.graph
     results: list[Buffer] = []
@@ -62,7 +59,7 @@ def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]
 
 
 def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
-    """An array in memory as it is, where it is all of what the program filled; else copied."""
+    """Return an array's buffer if it is all of one that the program filled; else copy the array."""
     buffer = value.buffer
     whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
     alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
@@ -73,7 +70,7 @@ def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemor
 
 
 def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
-    """Nodes in new memory, known ones too."""
+    """Store nodes in new memory, constants too."""
     flat: list[Node] = nodes.ravel().tolist()
     buffer = Buffer("scratch", flat[0].type if flat else "f64", nodes.shape, lowering.graph.current)
     for place, node in enumerate(flat):
@@ -90,13 +87,13 @@ def written(
     last: Collection[int] = (),
     summed: Summed | None = None,
 ) -> Code:
-    """The text of a program whose inputs differ between runs, or do not.
+    """Write a program; `differing` says of each input whether it differs between runs.
 
-    `alone`: one run, whose arrays are used in place; results of the numbers `last` may lie where arguments did.
-    `summed`: outputs that are summed over runs.
+    `alone`: one run, whose arrays are used in place; results of the numbers `last` may overwrite arguments. `summed`:
+    outputs that are summed over runs.
 
     Raises:
-        Unsupported: an operation that has no text.
+        Unsupported: an operation that has no text, or a program that is too long.
     """
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
@@ -104,6 +101,7 @@ def written(
     operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
     if operations > LONGEST:
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
+    # Numbers that differ between runs; all others are computed once.
     spread = varying(outputs, lanes)
     if alone:
         spread = items | set(program.inputs)
@@ -111,6 +109,7 @@ def written(
     tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
     common = [b not in spread for b in outputs]
     spread -= set(tables)
+    # Layout: per thread in scratch memory, shared by all runs in shared memory.
     owners = {x.owner[0] for x in items if isinstance(x, Buffer)}
     added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
     _check_sums(items, added)
@@ -124,6 +123,7 @@ def written(
         0,
     )
     shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0)
+    # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
     differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
@@ -131,6 +131,7 @@ def written(
     blocks = Writer(width, mine, products, spread, slots)
     text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
     text = _with_functions(text, blocks)
+    # The other function fills these slots, once for all runs.
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
     once = None
@@ -143,24 +144,24 @@ def written(
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
-    """Sums are written to alone: a number that is used again lies elsewhere too."""
+    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
     read = {x.value[0].owner[0] for x in items if isinstance(x, Node) and x.op == "load"}
     if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")
 
 
 def sorted_items(items: Iterable[Any]) -> list[Any]:
-    """In one order, whatever that of the set."""
+    """Sort items, so that the text does not depend on the order of a set."""
     return sorted(items, key=lambda x: x.serial if isinstance(x, Node) else -1)
 
 
 def _work(items: Iterable[Any]) -> int:
-    """Operations of a block of runs; a loop that data end counts as one turn."""
+    """Count the executed operations of a block of runs; a loop of unknown length counts as one turn."""
     return sum(math.prod(loop.length or 1 for loop in loops_of(x)) for x in items if isinstance(x, Node))
 
 
 def _places(buffers: Iterable[Buffer], width: int, start: int) -> tuple[int, dict[Buffer, int]]:
-    """Where buffers lie one after another, in bytes, and the end."""
+    """Place buffers one after another; return the end and each one's offset, in bytes."""
     places: dict[Buffer, int] = {}
     for buffer in buffers:
         places[buffer] = start
@@ -182,10 +183,11 @@ def _blocks(
     alone: bool,
     summed: Summed | None,
 ) -> str:
-    """Blocks `begin` to `end` of W runs: inputs transposed, computed, outputs transposed back."""
+    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
     names = _pointers(writer, pointers, in_shared)
     for buffer, place in in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {place}")
+    # Loop over blocks; the block `number` has runs from `first` on.
     writer.line("%last = sub i64 %runs, 1")
     writer.line("br label %block")
     writer.start("block")
@@ -199,6 +201,7 @@ def _blocks(
         pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
         writer.line(f"call void @{kind}{bits}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
 
+    # Inputs to lanes, the operations, lanes to outputs.
     taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]
     given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
     for buffer in taken:
@@ -210,6 +213,7 @@ def _blocks(
     for buffer in given:
         if buffer not in writer.sums:
             move("give", buffer)
+    # Next block.
     writer.line("br label %done")
     writer.start("done")
     writer.line("%next = add i64 %number, 1")
@@ -222,7 +226,7 @@ def _blocks(
 
 
 def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
-    """Have the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
+    """Make the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
     width = writer.width
     place = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
     run = writer.add(f"load i32, ptr {place}, align 4")
@@ -240,7 +244,7 @@ def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffe
 
 
 def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
-    """What all runs share."""
+    """Write the function that computes what all runs share."""
     _pointers(writer, pointers, in_shared)
     writer.block(program.graph.top)
     body = "\n".join(writer.lines)
@@ -248,7 +252,7 @@ def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: d
 
 
 def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
-    """Load the addresses of inputs, tables and outputs; the names of all, whose buffers start there unless moved."""
+    """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):
         place = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")
@@ -263,7 +267,7 @@ def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, in
 
 
 def _with_functions(text: str, writer: Writer) -> str:
-    """With the functions that it calls."""
+    """Add the functions that the text calls."""
     called = writer.called - {"threefry"}
     parts = [text]
     if called:

@@ -1,7 +1,7 @@
-"""The text of LLVM IR for each scalar operation, on vectors <W x T> of as many runs.
+"""Scalar operations as text of LLVM IR, on vectors <W x T> of as many runs.
 
-Nothing is left to the compiler's judgement: a product and a sum are one fused operation only where the text says so,
-so that the bits of a result depend neither on the width nor on the level of optimisation.
+The compiler decides nothing: a product and a sum are one fused operation only where the text says so, so that the bits
+of a result depend neither on the width nor on the level of optimisation.
 """
 
 import struct
@@ -22,12 +22,12 @@ Emit = Callable[[str], str]  # the text of an operation -> the name of its resul
 
 
 def vector(type: Type, width: int) -> str:
-    """<W x T>."""
+    """Return the type <W x T>."""
     return f"<{width} x {LLVM[type]}>"
 
 
 def literal(value: float | int | bool, type: Type) -> str:
-    """A known number, doubles by their bits."""
+    """Return a constant; doubles by their bits."""
     if type == "f64":
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":
@@ -36,17 +36,18 @@ def literal(value: float | int | bool, type: Type) -> str:
 
 
 def splat(value: float | int | bool, type: Type) -> str:
-    """A known number in all runs."""
+    """Return a constant in all lanes."""
     return f"splat ({LLVM[type]} {literal(value, type)})"
 
 
 def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
-    """Emit what computes a node of its arguments' names; the name of the result."""
+    """Emit the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
     local, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
     op, result = node.op, vector(node.type, width)
     if op == "select":
         return emit(f"select {local} {names[0]}, {result} {names[1]}, {result} {names[2]}")
+    # Comparisons and conversions depend on the type of the arguments.
     if op in ORDER:
         return emit(f"{_comparison(op, source)} {local} {names[0]}, {names[1]}")
     if op == "convert":
@@ -55,6 +56,7 @@ def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
         return emit(f"bitcast {local} {names[0]} to {result}")
     if op == "not":
         return emit(f"xor {local} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+    # Functions of `vector_math`, then arithmetic by type.
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result} @hg_{op}({typed})")
@@ -79,11 +81,13 @@ def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emi
         return emit(f"fneg {first}")
     if op in UNARY:
         return emit(f"call {text} @llvm.{UNARY[op]}.{kind}({first})")
+    # maximum and minimum of IEEE 754-2019: NaN if either is.
     if op in ("max", "min"):
         return emit(f"call {text} @llvm.{op}imum.{kind}({first}, {text} {names[1]})")
     if op == "is_finite":
         size = emit(f"call {text} @llvm.fabs.{kind}({first})")
         return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
+    # sign x = x for zeros and NaN.
     if op == "sign":
         item = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
         other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
@@ -104,6 +108,7 @@ def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit)
         return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}.{kind}({first}, {text} {names[1]})")
     if op == "abs" and signed:
         return emit(f"call {text} @llvm.abs.{kind}({first}, i1 false)")
+    # Division by zero and shifts by all bits are undefined in LLVM: only constants are accepted.
     if op in ("div", "rem") and node.args[1].op == "constant" and node.args[1].value > 0:
         return emit(f"{'s' if signed else 'u'}{op} {first}, {names[1]}")
     if op in ("shift_left", "shift_right", "shift_right_signed") and node.args[1].op == "constant":
@@ -129,7 +134,7 @@ def _converted(source: Type, target: Type, name: str, width: int, emit: Emit) ->
 
 
 def fused(node: Node, product: Node, names: list[str], width: int, emit: Emit) -> str:
-    """a b + c, c - a b or a b - c, rounded once; names of a, b, c."""
+    """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
     local = vector("f64", width)
     a, b, c = names
     if node.op == "sub":

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 class Slots:
-    """Where numbers that all runs share, which one function computes and the other uses, lie in memory.
+    """Layout of numbers that all runs share: one function computes them, the other reads them.
 
-    One in a loop has a place for each turn.
+    A number in a loop has a place for each turn.
     """
 
     def __init__(self, size: int):
@@ -23,7 +23,7 @@ class Slots:
         self.base = ""
 
     def place(self, node: Node) -> int:
-        """Where a number lies; it is given a place when it is first used."""
+        """Return the offset of a number, assigned at its first use."""
         if node not in self.places:
             self.places[node] = self.size
             turns = 1
@@ -33,7 +33,7 @@ class Slots:
         return self.places[node]
 
     def load(self, writer: Writer, node: Node) -> str:
-        """A shared number, a scalar."""
+        """Load a shared number, a scalar."""
         address = self._address(writer, node)
         loaded = writer.add(f"load i{BITS[node.type]}, ptr {address}, align 8")
         if node.type == "bool":
@@ -41,7 +41,7 @@ class Slots:
         return writer.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
 
     def store(self, writer: Writer, node: Node, name: str) -> None:
-        """Write it where it is computed, if the other function uses it."""
+        """Store a number if the other function uses it."""
         if node not in self.places or writer.width != 1:
             return
         local = vector(node.type, 1)
@@ -62,5 +62,5 @@ class Slots:
 
 
 def loops_of(node: Node) -> list[Loop]:
-    """The loops around a node, innermost first."""
+    """Return the loops around a node, innermost first."""
     return [b.owner for b in node.block.inwards() if isinstance(b.owner, Loop)]

@@ -1,4 +1,4 @@
-"""A program as text of LLVM IR: one function that computes blocks of W runs, and one for what all runs share."""
+"""Programs as text of LLVM IR: one function for blocks of W runs, and one for what all runs share."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,10 @@ Scope = dict[Any, str]
 
 
 class Writer:
-    """Writes the operations of a program that are `mine`: of those that differ between runs, or of those that do not.
+    """Writer of a program's operations in the set `mine`: those that differ between runs, or those that do not.
 
-    `bases` holds each buffer's address, `spread` which buffers have a number for each lane. Of a number that all runs
-    share, and another function computed, `shared` says where it lies.
+    `bases` has each buffer's address, `spread` the buffers with a number for each lane. `shared` locates numbers that
+    all runs share and that the other function computes.
     """
 
     def __init__(self, width: int, mine: set[Any], products: set[Node], spread: set[Any], slots: Slots):
@@ -31,13 +31,13 @@ class Writer:
         self.counted = ""  # the lanes that count
 
     def add(self, text: str) -> str:
-        """A fresh name for what the text computes."""
+        """Append an operation; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %t{self.count} = {text}")
         return f"%t{self.count}"
 
     def line(self, text: str) -> None:
-        """A line that has no result."""
+        """Append a line without a result."""
         self.lines.append(f"  {text}")
 
     def start(self, label: str) -> None:
@@ -46,7 +46,7 @@ class Writer:
         self.label = label
 
     def block(self, block: Block) -> None:
-        """Operations and statements in their order."""
+        """Write operations and statements in order."""
         for item in block.items:
             if item not in self.mine:
                 continue
@@ -77,7 +77,7 @@ class Writer:
         return operation(node, [self.operand(a) for a in node.args], self.width, self.add)
 
     def operand(self, node: Node) -> str:
-        """The name of a number in all lanes."""
+        """Return the name of a number in all lanes."""
         if node.op == "constant":
             return splat(node.value, node.type)
         for scope in reversed(self.scopes):
@@ -89,7 +89,7 @@ class Writer:
         return name
 
     def scalar(self, node: Node) -> str:
-        """The name of a number that all lanes share."""
+        """Return the name of a number that all lanes share."""
         if node.op == "constant":
             return str(int(node.value))
         key = ("scalar", node)
@@ -114,7 +114,7 @@ class Writer:
         return self.add(f"shufflevector {local} {first}, {local} poison, <{self.width} x i32> zeroinitializer")
 
     def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
-        """Of the entry offset + sum strides * indices, each of so many lanes."""
+        """Return the address of entry offset + sum strides * indices, for entries of this many lanes."""
         owner, start = buffer.owner
         element = f"[{lanes} x i{BITS[owner.type]}]"
         base = self.bases[owner]
@@ -152,12 +152,13 @@ class Writer:
         return self.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
 
     def _gather(self, node: Node) -> str:
-        """Each lane from a place of its own."""
+        """Load a number at a different place in each lane."""
         buffer, offset, strides = node.value
         owner, start = buffer.owner
         lanes = self.width if owner in self.spread else 1
         if lanes == 1:
             self.read.add(owner)
+        # Place of each lane: (offset + sum strides * indices) lanes + lane.
         wide, local = f"<{self.width} x i64>", vector(node.type, self.width)
         place = f"splat (i64 {(offset + start) * lanes})"
         for stride, index in zip(strides, node.args, strict=True):
@@ -166,6 +167,7 @@ class Writer:
         if lanes > 1:
             numbers = ", ".join(f"i64 {lane}" for lane in range(self.width))
             place = self.add(f"add {wide} {place}, <{numbers}>")
+        # One load for each lane; booleans are stored as bytes.
         bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
         loaded = "poison"
         for lane in range(self.width):
@@ -190,9 +192,10 @@ class Writer:
         self.line(f"store {local} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
 
     def _loop(self, loop: Loop) -> None:
-        """Parameters are what the turn before made of them; a counted loop takes one turn at least."""
+        """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
         self.count += 1
         name, before = f"loop{self.count}", self.label
+        # Only the carried numbers that this function computes or reads.
         pairs = zip(loop.parameters, loop.results, strict=True)
         moving = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
         starts = [self.operand(loop.initial[k]) for k in moving]
@@ -207,6 +210,7 @@ class Writer:
             self._keep(loop.parameters[k], f"%{name}.p{k}")
         if loop.counter is not None and loop.counter in self.mine:
             self._keep(loop.counter, self.operand(loop.counter))
+        # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
             self.block(loop.body)
             following = [self.operand(loop.following[k]) for k in moving]
@@ -218,6 +222,7 @@ class Writer:
             results = following
         else:
             following, results = self._turns(loop, name, moving)
+        # The phi nodes come first, but their arguments are known only now.
         phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
         for k, start, after in zip(moving, starts, following, strict=True):
             local = vector(loop.parameters[k].type, self.width)
@@ -229,7 +234,7 @@ class Writer:
             self._keep(loop.results[k], result)
 
     def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
-        """A loop that ends when no lane's condition holds."""
+        """Write a loop that ends when no lane's condition holds."""
         check = next(i for i, item in enumerate(loop.body.items) if isinstance(item, Check) and item.loop is loop)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
@@ -246,7 +251,7 @@ class Writer:
         return following, [f"%{name}.p{k}" for k in moving]
 
     def _any(self, condition: Node) -> str:
-        """Whether a condition holds in some lane."""
+        """Emit whether a condition holds in some lane."""
         local = f"<{self.width} x i1>"
         bits = self.add(f"bitcast {local} {self.operand(condition)} to i{self.width}")
         return self.add(f"icmp ne i{self.width} {bits}, 0")
@@ -254,6 +259,7 @@ class Writer:
     def _guard(self, guard: Guard) -> None:
         self.count += 1
         name = f"guard{self.count}"
+        # Jump past the body if no lane needs it.
         some = self._any(guard.condition)
         before = self.label
         self.line(f"br i1 {some}, label %{name}, label %{name}.end")
@@ -266,6 +272,7 @@ class Writer:
         self.line(f"br label %{name}.end")
         self.start(f"{name}.end")
         self.scopes.pop()
+        # Results are zero where the body was skipped.
         for k, value in zip(used, values, strict=True):
             local = vector(guard.results[k].type, self.width)
             self._keep(guard.results[k], self.add(f"phi {local} [{value}, %{after}], [zeroinitializer, %{before}]"))

@@ -1,6 +1,6 @@
-"""Text of LLVM IR that moves arrays [run][entry] to [entry][lane] for a block of runs, and back.
+"""Transposition of arrays [run][entry] to [entry][lane] for a block of runs, and back, as text of LLVM IR.
 
-Of 64-bit numbers eight runs by eight entries at a time, as vectors; of others one number after another.
+64-bit numbers are moved eight runs by eight entries at a time, as vectors; others one by one.
 """
 
 from collections.abc import Callable
@@ -16,13 +16,13 @@ class Lines:
         self.count = 0
 
     def add(self, text: str) -> str:
-        """A new name for what the text computes."""
+        """Append an operation; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"
 
     def loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
-        """for (i = begin; i + step <= end; i += step) body."""
+        """Write a loop: for (i = begin; i + step <= end; i += step) body."""
         before, head, inside, after = f"{name}.before", f"{name}.head", f"{name}.inside", f"{name}.after"
         self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
         self.lines.append(f"  %{name}.i = phi i64 [{begin}, %{before}], [%{name}.next, %{inside}]")
@@ -34,20 +34,22 @@ class Lines:
 
 
 def mover(bits: int, width: int, inwards: bool) -> str:
-    """`void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which goes the other way.
+    """Write `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which moves back.
 
-    Lane l is run first + l, or the last run where there are fewer: it then repeats what that run does.
+    Lane l is run first + l, or the last run if there are fewer: it then repeats the computation of that run.
     """
     text, name = Lines(), f"{'take' if inwards else 'give'}{bits}"
     bytes_ = bits // 8
     for group in range(0, width, EIGHT):
         lanes = min(EIGHT, width - group)
+        # Address of each lane's run.
         rows = []
         for lane in range(group, group + lanes):
             place = text.add(f"add i64 %first, {lane}")
             place = text.add(f"call i64 @llvm.smin.i64(i64 {place}, i64 %last)")
             start = text.add(f"mul i64 {place}, %size")
             rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
+        # Squares of eight by eight, then the remaining entries.
         start = "0"
         if lanes == EIGHT and bits == 64:
             text.loop(f"g{group}", "0", "%size", EIGHT, _eight(text, rows, width, group, inwards))
@@ -59,7 +61,7 @@ def mover(bits: int, width: int, inwards: bool) -> str:
 
 
 def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) -> Callable[[str], None]:
-    """Eight entries of eight lanes."""
+    """Move eight entries of eight lanes."""
 
     def body(i: str) -> None:
         vector = "<8 x i64>"
@@ -78,7 +80,7 @@ def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) 
 
 
 def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
-    """One step of a transposition: off-diagonal squares of this size change places."""
+    """Do one step of a transposition: exchange off-diagonal squares of this size."""
     result = rows[:]
     for i in range(EIGHT):
         if i & half:
@@ -94,7 +96,7 @@ def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
 
 
 def _single(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:
-    """One entry of each lane."""
+    """Move one entry of each lane."""
 
     def body(i: str) -> None:
         base = text.add(f"mul i64 {i}, {width}")

@@ -1,7 +1,7 @@
-"""Numbers that are known to be none that are missing: what asks of them whether they are NaN is answered beforehand.
+"""Marks for numbers that are known to be present, so that tests for NaN in them are decided at compile time.
 
-So what a filter does for missing components costs nothing where none is ever missing, and what depends on data only
-by these is the same in all runs.
+Then a filter's treatment of missing components costs nothing where none is ever missing, and what depends on data only
+through such tests is the same in all runs.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _arrived: Any = Primitive("arrived")
 
 
 def arrived(x: jax.Array) -> jax.Array:
-    """The same numbers, of which the caller knows that none of them is NaN in place of one that is missing."""
+    """Return the same numbers, marked by the caller as never NaN in place of a missing one."""
     result: jax.Array = _arrived.bind(x)
     return result
 

@@ -1,6 +1,6 @@
-"""Rules of branches: the one that is taken where that is known, else both and a choice for each run.
+"""Rules of branches: a branch that is known to be taken, else both and a selection in each run.
 
-A dear branch is computed only where some run takes it (a guarded block).
+An expensive branch is computed only if some run takes it (a guarded block).
 """
 
 from itertools import pairwise
@@ -26,12 +26,14 @@ def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
         return lowering.inline(branches[taken], inputs[1:])
     if len(branches) == 1:
         return lowering.inline(branches[0], inputs[1:])
+    # Small branches are computed in any case, large ones in guarded blocks.
     conditions = _conditions(lowering, which, len(branches))
     sizes = [size_of(branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
         cheap = SHARE * sizes[k] <= max(sizes)
         results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:], cheap)
+    # Select the results of the branch that is taken.
     chosen = results[len(branches) - 1]
     for k in reversed(range(len(branches) - 1)):
         chosen = [_where(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
@@ -39,7 +41,7 @@ def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
 
 
 def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
-    """For each branch whether it is taken; numbers beyond are the first and last."""
+    """Return for each branch whether it is taken; indices out of range select the first or last."""
     graph = lowering.graph
     if which.op == "convert" and which.args[0].type == "bool":
         which = which.args[0]
@@ -51,7 +53,7 @@ def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
 
 
 def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value], cheap: bool) -> list[np.ndarray]:
-    """A branch's results: in the open block where it has few nodes, else in a guarded one."""
+    """Compute a branch in the open block if it has few nodes, else in a guarded one."""
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)
     try:
@@ -80,7 +82,7 @@ def _result(lowering: Lowering, guard: Guard, value: Any) -> Any:
 
 
 def _size(block: Block) -> int:
-    """Nodes of a block; a statement in it counts as dear."""
+    """Count the nodes of a block; a statement in it counts as many."""
     return sum(1 if isinstance(item, Node) else DEAR + 1 for item in block.items)
 
 

@@ -1,4 +1,4 @@
-"""Rules of programs inside programs: functions that are called, and branches."""
+"""Rules of inner programs: called functions, and branches by platform."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """A kernel over runs, traced for one run; of several runs inside one, such as modes, one after another."""
+    """Inline a kernel over runs, traced for one run; several runs in one, such as modes, one after another."""
     avals: list[Any] = [v.aval for v in equation.outvars]
     runs = equation.params["runs"]
     shapes = [a.shape[: a.ndim - len(runs)] for a in avals]
@@ -40,7 +40,7 @@ def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> l
 def _over(
     lowering: Lowering, equation: JaxprEqn, inputs: list[Value], runs: tuple[int, ...], shapes: list[tuple[int, ...]]
 ) -> list[Value]:
-    """The last axis of runs first: few written out, many in a loop."""
+    """Repeat over the last axis, that of runs: few are written out, many become a loop."""
     if not runs:
         results = zip(_single(lowering, equation, inputs), shapes, strict=True)
         return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
@@ -59,7 +59,7 @@ def _over(
 
 
 def _together(lowering: Lowering, results: list[Value]) -> Value:
-    """A result of few runs with the runs last: in memory where it is long."""
+    """Stack results of a few runs along the last axis; in memory if they are long."""
     x = results[0]
     if not isinstance(x, InMemory) or x.size <= LONG:
         return np.stack([lowering.nodes(x) for x in results], axis=-1)
@@ -83,7 +83,7 @@ def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
 
 
 def _run(x: Value, place: Node | int) -> Value:
-    """One run's part of an argument whose last axis are the runs, or one number for all of them."""
+    """Return one run's part of an argument whose last axis is that of runs, or a number shared by all."""
     if isinstance(x, InMemory):
         last = x.view([x.shape[-1], *x.shape[:-1]], [x.strides[-1], *x.strides[:-1]])
         return last.row(0 if x.shape[-1] == 1 else place)
@@ -92,7 +92,7 @@ def _run(x: Value, place: Node | int) -> Value:
 
 
 def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """The branch of a program that is meant for processors."""
+    """Select the branch of a program for CPUs."""
     platforms = equation.params["platforms"]
     number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
     return [lowering.known(np.int32(number))]

@@ -1,4 +1,4 @@
-"""The rule of eigenvalues and eigenvectors of a small symmetric matrix: rotations until nothing is left beside them."""
+"""Rule of the eigendecomposition of a small symmetric matrix: Jacobi rotations until it is diagonal."""
 
 from functools import cache
 from itertools import combinations
@@ -18,15 +18,16 @@ Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
 
 
 def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eigenvectors (n, n), columns, and eigenvalues (n,), ascending; all NaN where an entry is no finite number.
+    """Compute eigenvectors (n, n), in columns, and eigenvalues (n,), ascending; all NaN if an entry is not finite.
 
-    A rotation of each pair of rows in turn makes its entry zero; sweeps end when what is left is rounding.
+    Each rotation makes one off-diagonal entry zero; sweeps over all pairs end when the rest is below rounding.
 
     Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5.
     """
     n, eps = len(a), float(np.finfo(np.float64).eps)
     entries = {(i, j): (a[i, j] + a[j, i]) / 2 for i in range(n) for j in range(i, n)}
     finite = jnp.all(jnp.isfinite(a))
+    # Off-diagonal entries below eps ||A||_F / n are rounding.
     size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
     vectors = {(i, j): jnp.asarray(float(i == j)) for i in range(n) for j in range(n)}
 
@@ -34,6 +35,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(rest)) & (state[2] < SWEEPS)
 
+    # One sweep: A <- J' A J, V <- V J for each pair (p, q).
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
         entries, vectors = dict(state[0]), dict(state[1])
         for p, q in combinations(range(n), 2):
@@ -42,6 +44,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     if n > 1:
         entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
+    # Sort by odd-even transposition, which needs no branches.
     values = [entries[i, i] for i in range(n)]
     columns = [[vectors[i, j] for i in range(n)] for j in range(n)]
     for turn in range(n):
@@ -70,7 +73,7 @@ def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
 
 
 def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
-    """Have places i and i + 1 in ascending order."""
+    """Exchange places i and i + 1 unless they are in ascending order."""
     wrong = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
     low, high = columns[i], columns[i + 1]

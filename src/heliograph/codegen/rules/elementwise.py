@@ -1,4 +1,4 @@
-"""Rules of operations that act on each entry alone."""
+"""Rules of elementwise operations."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -20,7 +20,7 @@ ELEMENTWISE = {name: name for name in (
 
 
 def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
-    """The entries of several arrays in row-major order, axes of length 1 repeated."""
+    """Return the entries of several arrays in row-major order, axes of length 1 repeated."""
     return [(a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist() for a in arrays]
 
 
@@ -33,7 +33,7 @@ def _elementwise(op: str) -> Rule:
 
 
 def _composed(function: Any) -> Rule:
-    """A rule of one entry: function(graph, type, parameters, *entries)."""
+    """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
@@ -44,7 +44,7 @@ def _composed(function: Any) -> Rule:
 
 
 def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
-    """a where the condition holds, else b: of numbers or of keys."""
+    """Select a where the condition holds, else b: of numbers or of keys."""
     if isinstance(a, Key):
         return Key(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
     return graph.node("select", a.type, condition, a, b)
@@ -66,7 +66,7 @@ def _key_select(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]
 
 
 def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """x^n by squarings."""
+    """Compute x^n by repeated squaring."""
     exponent = abs(params["y"])
     factors, square = [], x
     while exponent:

@@ -1,4 +1,4 @@
-"""Rules of gathering and scattering: which entry goes where is known, or a choice that data make among few."""
+"""Rules of gather and scatter at known places, or at one of a few places that data select."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,23 +24,26 @@ def _places(
     removed: Sequence[int],
     clips: bool,
 ) -> np.ndarray:
-    """For each index (...) and entry of its window (...), the place in an array of this shape; -1 beyond its edges.
+    """Return for each index (...) and entry of its window (...) the place in an array of this shape; -1 outside.
 
     `index_map`: the array's axis for each number of an index; `batching`: pairs of an axis of the array and one of the
-    indices that go together; `removed`: axes that a window does not have.
+    indices that correspond; `removed`: axes that a window does not have.
     """
+    # First corner of each window, axis by axis.
     starts = np.zeros((*indices.shape[:-1], len(shape)), dtype=np.int64)
     for k, axis in enumerate(index_map):
         starts[..., axis] = indices[..., k]
     for axis, along in batching:
         count = np.arange(indices.shape[along])
         starts[..., axis] = count.reshape([-1 if a == along else 1 for a in range(indices.ndim - 1)])
+    # Place of the corner in row-major order; corners are clipped or marked as outside.
     last = np.array(shape) - np.array(sizes)
     inside = np.all((starts >= 0) & (starts <= last), axis=-1)
     strides = np.array(contiguous(shape), dtype=np.int64)
     base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
     if not clips:
         base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))
+    # Offsets of the entries of a window from its corner.
     left = [a for a in range(len(shape)) if a not in removed]
     offsets = np.zeros([sizes[a] for a in left], dtype=np.int64)
     for place, a in enumerate(left):
@@ -58,6 +61,7 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     at = known_integers(indices)
     if at is None:
         return [_by_cases(lowering, equation, x, indices)]
+    # Places in the flat array, with the axes of windows where the result has them.
     params, numbers = equation.params, equation.params["dimension_numbers"]
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
     removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -67,6 +71,7 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     first = at.ndim - 1
     places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
     flat = x.ravel()
+    # Places outside read one more entry, the fill value.
     if np.any(places < 0):
         missing, aval = params["fill_value"], equation.outvars[0].aval
         dtype = aval.dtype  # type: ignore[attr-defined]
@@ -77,9 +82,9 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 
 
 def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With indices (..., axis) that data decide: what is gathered for each number that those of an axis may be.
+    """Gather at indices (..., axis) that depend on data: one gather for each possible value, then a selection.
 
-    Each entry is chosen by the index of its own row alone, so that rows of many nodes are no more cases than one.
+    Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
     """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
@@ -98,7 +103,7 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
 
 
 def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, place: int) -> np.ndarray:
-    """The same of many places: each entry is loaded from as far on as its row's index says."""
+    """Gather from memory if there are many places: each entry is loaded at an offset by its row's index."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axis = numbers.start_index_map[place]
     begin = _with(lowering, indices, place, 0)
@@ -117,7 +122,7 @@ def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices:
 
 
 def _with(lowering: Lowering, indices: np.ndarray, place: int, number: int) -> np.ndarray:
-    """Indices with a number in place of each that data decide."""
+    """Replace the indices that depend on data by a number."""
     result = indices.copy()
     for row in np.ndindex(*indices.shape[:-1]):
         node = indices[(*row, place)]
@@ -127,12 +132,12 @@ def _with(lowering: Lowering, indices: np.ndarray, place: int, number: int) -> n
 
 
 def _row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
-    """Of which row of indices an entry of the result is gathered."""
+    """Return the row of indices from which an entry of the result is gathered."""
     return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
 
 
 def _scatter(op: str | None) -> Rule:
-    """Updates one after another; what lies beyond the edges is dropped."""
+    """Make a rule that applies updates one after another; those outside the array are dropped."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         x, indices, updates = inputs
@@ -140,6 +145,7 @@ def _scatter(op: str | None) -> Rule:
         if at is None:
             raise Unsupported(f"{equation.primitive.name} at places that data decide")
         params, numbers = equation.params, equation.params["dimension_numbers"]
+        # Places of all updates in the flat array.
         removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         windows = iter(updates.shape[a] for a in numbers.update_window_dims)
         sizes = [1 if a in removed else next(windows) for a in range(x.ndim)]
@@ -147,6 +153,7 @@ def _scatter(op: str | None) -> Rule:
         index_map = numbers.scatter_dims_to_operand_dims
         places = _places(x.shape, sizes, at, index_map, batching, removed, _clips(params["mode"]))
         places = np.moveaxis(places, range(at.ndim - 1, places.ndim), numbers.update_window_dims)
+        # Apply the updates in order.
         result = x.ravel().copy()
         for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
             if place >= 0:

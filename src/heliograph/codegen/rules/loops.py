@@ -1,4 +1,4 @@
-"""Loops: short ones are written out; long ones stay loops, with what they stack in memory, and so do `while` loops."""
+"""Rules of loops: short ones are written out; long ones stay loops with stacked results in memory, as does `while`."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,14 +19,15 @@ Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[n
 def repeated(
     lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
 ) -> tuple[list[np.ndarray], list[InMemory]]:
-    """What is carried after `length` turns, and what each of them stacks, in memory.
+    """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
 
-    turn(place, carry) -> what is carried on, what is stacked at that place; places run from 0, or down to 0.
+    turn(place, carry) returns the next carry, and what is stacked at that place; places run from 0 up, or down to 0.
     """
     graph, outer = lowering.graph, lowering.graph.current
     body = Block(outer)
     loop = Loop(body, length, [n for x in carry for n in words(x)])
     loop.counter = counter = graph.fresh("counter", "i64", (), body, loop)
+    # In the body the carry is a parameter; the turn is traced once.
     loop.parameters = [
         graph.fresh("parameter", n.type, (), body, (loop, place)) for place, n in enumerate(loop.initial)
     ]
@@ -37,6 +38,7 @@ def repeated(
     memory = [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
     graph.current = outer
     outer.items.append(loop)
+    # After the loop the carry is a result.
     loop.results = [graph.fresh("result", n.type, (), outer, (loop, place)) for place, n in enumerate(loop.initial)]
     return _like(carry, loop.results), memory
 
@@ -44,7 +46,7 @@ def repeated(
 def _stack(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> InMemory:
-    """Store this turn's numbers of an array as one row of memory."""
+    """Store one turn's array as one row of memory."""
     flat = _numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
@@ -56,7 +58,7 @@ def _stack(
 
 
 def words(value: np.ndarray) -> list[Node]:
-    """The nodes of an array in row-major order, a key as its two words."""
+    """Return the nodes of an array in row-major order, a key as its two words."""
     flat: list[Any] = value.ravel().tolist()
     return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
 
@@ -69,7 +71,7 @@ def _numbers(value: np.ndarray) -> list[Node]:
 
 
 def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node]) -> list[np.ndarray]:
-    """Nodes in arrays of the same shapes, keys again."""
+    """Restore arrays of the same shapes from nodes, and keys."""
     rest = iter(nodes)
     return [
         array_of(
@@ -84,12 +86,15 @@ def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     consts, carried, length = params["num_consts"], params["num_carry"], params["length"]
     fixed, rows = inputs[:consts], inputs[consts + carried :]
     carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
+    # Short loops are written out.
     if length * size_of(params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
         return _written_out(lowering, equation, fixed, carry, rows)
     jaxpr = params["jaxpr"].jaxpr
+    # A carried number that the body returns unchanged is a constant of the loop.
     same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
     rows = [in_memory(lowering, x) for x in rows]
 
+    # One turn: the body for row `place` of the stacked arguments.
     def turn(place: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         items = iter(moving)
         now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
@@ -124,12 +129,12 @@ def _written_out(
 
 
 def _entry(x: np.ndarray, turn: int) -> np.ndarray:
-    """x[turn] as an array, of one axis too."""
+    """Return x[turn] as an array, also for one axis."""
     return x[turn : turn + 1].reshape(x.shape[1:])
 
 
 def in_memory(lowering: Lowering, value: Value) -> InMemory:
-    """An array of nodes, stored."""
+    """Store an array of nodes in memory."""
     if isinstance(value, InMemory):
         return value
     flat = _numbers(value)
@@ -145,12 +150,12 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
 
 
 def copied(lowering: Lowering, x: InMemory) -> InMemory:
-    """The same long array in new memory of its own."""
+    """Copy a long array to new memory."""
     return repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1][0]
 
 
 def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Turns as long as some run's condition holds; a run whose condition does not keeps its numbers."""
+    """Lower a loop that ends when no run's condition holds; a run whose condition is false keeps its carry."""
     params, graph, outer = equation.params, lowering.graph, lowering.graph.current
     conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
@@ -160,6 +165,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
     graph.current = body
     now = _like(carry, loop.parameters)
+    # The check comes before the body; there the carry is selected by each run's condition.
     loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
     body.items.append(Check(loop))
     results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
@@ -172,7 +178,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 
 
 def size_of(jaxpr: Any) -> int:
-    """Numbers that a traced program computes, about."""
+    """Estimate the count of numbers that a traced program computes."""
     total = 0
     for equation in jaxpr.eqns:
         inner = [size_of(getattr(p, "jaxpr", p)) for p in _programs(equation.params)]

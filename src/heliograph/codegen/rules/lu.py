@@ -1,4 +1,4 @@
-"""The rule of factors of a small regular matrix, A = P L U, with rows exchanged by what the data are."""
+"""Rule of the LU decomposition of a small regular matrix, A = P L U, with pivots selected by data."""
 
 from functools import cache
 from typing import Any
@@ -15,15 +15,16 @@ LARGEST = 8  # rows
 
 
 def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """L below the diagonal and U (n, n), the row that each step took, and the order of rows (n,).
+    """Compute L below the diagonal and U (n, n), the pivot row of each step (n,), and the order of rows (n,).
 
-    Each step takes the largest entry that is left of its column, one reciprocal each.
+    Each step takes the largest entry of the rest of its column, and needs one reciprocal.
 
     Source: Golub and Van Loan, Matrix computations, section 3.4.
     """
     n = len(a)
     rows, order, pivots = list(a), list(jnp.arange(n, dtype=jnp.int32)), []
     for j in range(n):
+        # Partial pivoting: the largest |a_ij|, i >= j.
         column = jnp.abs(jnp.stack([row[j] for row in rows[j:]]))
         taken = j + jnp.argmax(column).astype(jnp.int32)
         pivots.append(taken)
@@ -31,6 +32,7 @@ def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             here = taken == i
             rows[j], rows[i] = jnp.where(here, rows[i], rows[j]), jnp.where(here, rows[j], rows[i])
             order[j], order[i] = jnp.where(here, order[i], order[j]), jnp.where(here, order[j], order[i])
+        # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j.
         scale = 1 / rows[j][j]
         for i in range(j + 1, n):
             factor = rows[i][j] * scale
@@ -54,7 +56,7 @@ def _program(n: int) -> ClosedJaxpr:
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """A system with a solver of its own: that solver."""
+    """Solve a system by the solver that it comes with."""
     programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
     before = lengths.matvec + lengths.vecmat
     fixed = inputs[before : before + lengths.solve]

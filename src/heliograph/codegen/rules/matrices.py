@@ -1,4 +1,4 @@
-"""Rules of sums, products and factors: written out, entry by entry."""
+"""Rules of sums, products and decompositions: written out, entry by entry."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -12,7 +12,7 @@ from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_
 
 
 def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
-    """Nodes joined one by one; `empty` where there are none."""
+    """Combine nodes one by one; return `empty` if there are none."""
     if not nodes:
         return graph.constant(empty, type)
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
@@ -42,7 +42,7 @@ def _cumulative(op: str) -> Rule:
 
 
 def _arg(op: str) -> Rule:
-    """The first place of the greatest or least entry; of NaN, as in JAX, the first NaN."""
+    """Make a rule for the first index of the greatest or least entry; as in JAX, of the first NaN if there is one."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         graph, type = lowering.graph, result_type(equation)
@@ -53,6 +53,7 @@ def _arg(op: str) -> Rule:
         for row in x.tolist():
             best, place = row[0], graph.constant(0, type)
             for number, entry in enumerate(row[1:], 1):
+                # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
                 known = graph.node("eq", "bool", best, best)
                 beyond = graph.node(op, "bool", entry, best)
                 is_nan = graph.node("ne", "bool", entry, entry)
@@ -66,7 +67,7 @@ def _arg(op: str) -> Rule:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Sums of products over the contracted axes, batch axes first."""
+    """Sum products over the contracted axes, with batch axes first."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     a, b = (_batched(x, c, d) for x, c, d in ((inputs[0], left, left_batch), (inputs[1], right, right_batch)))
     graph, type, inner = lowering.graph, result_type(equation), a.shape[2]
@@ -80,14 +81,14 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
 
 
 def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-    """As (batch, free, contracted)."""
+    """Arrange as (batch, free, contracted)."""
     free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
     sizes = [int(np.prod([x.shape[d] for d in axes], dtype=int)) for axes in (batch, free, contracted)]
     return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
 
 
 def _each_matrix(function: Any) -> Rule:
-    """A rule of the last two axes: function(graph, parameters, *matrices) for each of the axes before them."""
+    """Make a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         flat = [x.reshape(-1, *x.shape[-2:]) for x in inputs]
@@ -98,17 +99,19 @@ def _each_matrix(function: Any) -> Rule:
 
 
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
-    """Column by column, one reciprocal each; NaN for a matrix that is not positive definite."""
+    """Compute A = L L' column by column, one reciprocal each; NaN if the matrix is not positive definite."""
     n = len(a)
     zero = graph.constant(0.0, "f64")
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
+        # a_ij - sum_k l_ik l_jk for the rows i >= j.
         rests = []
         for i in range(j, n):
             rest = a[i, j]
             for k in range(j):
                 rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", lower[i, k], lower[j, k]))
             rests.append(rest)
+        # l_jj = sqrt(rest), l_ij = rest / l_jj.
         root = graph.node("sqrt", "f64", rests[0])
         positive = graph.node("gt", "bool", rests[0], zero)
         root = graph.node("select", "f64", positive, root, graph.constant(float("nan"), "f64"))
@@ -120,7 +123,7 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
 
 
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """X with A X = B (or X A = B, or with A'), one reciprocal for each diagonal entry."""
+    """Solve A X = B (or X A = B, or with A') by substitution, one reciprocal for each diagonal entry."""
     if params["conjugate_a"]:
         raise Unsupported("complex numbers")
     lower, transposed = params["lower"], params["transpose_a"]
@@ -128,6 +131,7 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
         transposed, b = not transposed, b.T
     if transposed:
         a, lower = a.T, not lower
+    # x_i = (b_i - sum_j a_ij x_j) / a_ii, in the order of substitution.
     n, item = len(a), graph.constant(1.0, "f64")
     scales = [item if params["unit_diagonal"] else graph.node("div", "f64", item, a[i, i]) for i in range(n)]
     x = np.empty(b.shape, dtype=object)

@@ -1,10 +1,10 @@
-"""JAX's random numbers bit for bit: rules of its operations on keys, and the hash as text of LLVM IR.
+"""Random numbers of JAX bit for bit: rules of operations on keys, and the hash as text of LLVM IR.
 
 A key is two words, and every draw and every new key is the hash of a counter by a key. In the graph the hash is one
 operation, "threefry" of the key's words and the counter's, whose result (u64) is the first word above the second.
 
-Source: Salmon, Moraes, Dror, Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), section 5.2; how JAX counts is
-that of its flag jax_threefry_partitionable.
+Source: Salmon, Moraes, Dror, Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), section 5.2; JAX counts as with
+its flag jax_threefry_partitionable.
 """
 
 import math
@@ -23,7 +23,7 @@ PARITY = 0x1BD11BDA
 
 
 def threefry(graph: Graph, key: Key, high: Node, low: Node) -> Node:
-    """The hash of a counter's two words, its first word above the second; known where all of them are."""
+    """Hash a counter's two words, the first word above the second; a constant if all words are."""
     words = (key.first, key.second, high, low)
     if all(word.op == "constant" for word in words):
         return graph.constant(hashed(*(int(word.value) for word in words)), "u64")
@@ -48,7 +48,7 @@ def _unwrap(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 
 
 def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """The key that is the hash of (0, number)."""
+    """Return the key that is the hash of (0, number)."""
     _check(equation.invars[0])
     shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
     pairs = zip(*broadcast(inputs, shape), strict=True)
@@ -56,7 +56,7 @@ def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Of each key the keys that are the hashes of 0, 1, 2, ..."""
+    """Return for each key the keys that are the hashes of 0, 1, 2, ..."""
     _check(equation.invars[0])
     graph, counters = lowering.graph, _counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
@@ -64,7 +64,7 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Of each key the hashes of 0, 1, 2, ...; 32 bits are both words added bit by bit."""
+    """Return for each key the hashes of 0, 1, 2, ...; 32 bits are the exclusive or of both words."""
     _check(equation.invars[0])
     graph, width = lowering.graph, equation.params["bit_width"]
     counters = _counters(graph, equation.params["shape"])
@@ -79,7 +79,7 @@ def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """The key whose words are those of the number."""
+    """Return the key whose words are those of the number."""
     _check(equation.outvars[0])
     graph = lowering.graph
 
@@ -94,7 +94,7 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """The hash itself, of words (...)."""
+    """Hash words (...)."""
     shape = result_shape(equation)
     items = zip(*broadcast(inputs, shape), strict=True)
     keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in items]
@@ -102,7 +102,7 @@ def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
-    """JAX's program for gamma variables, a loop until a proposal is accepted."""
+    """Lower JAX's program for gamma variables, a loop until a proposal is accepted."""
     gamma: Any = equation.primitive.impl
     avals: list[Any] = [v.aval for v in equation.invars]
     program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
@@ -114,12 +114,12 @@ def _same(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
-    """0, 1, 2, ... as two words each."""
+    """Return 0, 1, 2, ... as two words each."""
     return [(graph.constant(i >> 32, "u32"), graph.constant(i & 0xFFFFFFFF, "u32")) for i in range(math.prod(shape))]
 
 
 def _check(variable: Any) -> None:
-    """Keys of JAX's own hash are lowered, counted as its newer releases do."""
+    """Raise unless keys are of JAX's default hash, counted as its newer releases do."""
     if str(variable.aval.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {variable.aval.dtype}")
     if not jax.threefry_partitionable.value:
@@ -133,7 +133,7 @@ RULES |= {
 
 
 def hashed(first: int, second: int, high: int, low: int) -> int:
-    """The hash of known words: 20 rounds of addition, rotation and exclusive or; a key's word is added every four."""
+    """Hash known words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
     keys = (first, second, first ^ second ^ PARITY)
     x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF
     for four in range(5):
@@ -145,7 +145,7 @@ def hashed(first: int, second: int, high: int, low: int) -> int:
 
 
 def hash_function(width: int) -> str:
-    """The text of `define internal <W x i64> @hg_threefry(<W x i32> ...)` of a key's and a counter's two words."""
+    """Write `define internal <W x i64> @hg_threefry(<W x i32> ...)` of a key's and a counter's two words."""
     vector = f"<{width} x i32>"
     rotate = f"@llvm.fshl.v{width}i32"
     lines: list[str] = []
@@ -154,9 +154,11 @@ def hash_function(width: int) -> str:
         lines.append(f"  %t{len(lines)} = {text}")
         return f"%t{len(lines) - 1}"
 
+    # Key schedule: k_2 = k_0 ^ k_1 ^ parity.
     both = op(f"xor {vector} %a, %b")
     keys = ("%a", "%b", op(f"xor {vector} {both}, splat (i32 {PARITY})"))
     x, y = op(f"add {vector} %x, %a"), op(f"add {vector} %y, %b")
+    # Five times four rounds, each with the next two key words.
     for four in range(5):
         for bits in ROTATIONS[four % 2]:
             x = op(f"add {vector} {x}, {y}")
@@ -165,6 +167,7 @@ def hash_function(width: int) -> str:
         x = op(f"add {vector} {x}, {keys[(four + 1) % 3]}")
         y = op(f"add {vector} {y}, {keys[(four + 2) % 3]}")
         y = op(f"add {vector} {y}, splat (i32 {four + 1})")
+    # Both words as one of 64 bits.
     wide = f"<{width} x i64>"
     high, low = op(f"zext {vector} {x} to {wide}"), op(f"zext {vector} {y} to {wide}")
     result = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")

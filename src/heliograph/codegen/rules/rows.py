@@ -1,6 +1,6 @@
-"""Rules of arithmetic on long arrays in memory: a loop over their rows, one row after another.
+"""Rules of arithmetic on long arrays in memory: a loop over their rows.
 
-What `vmap` made of a step, for each row of a record at once, becomes that step in a loop again.
+What `vmap` made of a step, for all rows of a record at once, becomes that step in a loop again.
 """
 
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Whether nodes for all entries of some argument would be too many; of tables alone they are numbers."""
+    """Return whether nodes for all entries of an argument would be too many; those of tables alone are constants."""
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
     known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
     return longest > LARGE or (longest > LONG and not (known and _are_known(inputs)))
@@ -51,20 +51,20 @@ def _of_entries(name: str) -> Rule:
 
 
 def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Carried and stacked arrays, loaded."""
+    """Load carried and stacked arrays."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
 def row_of(lowering: Lowering, x: Value, place: Node, ndim: int) -> Value:
-    """The part of an argument that a row of the result needs."""
+    """Return the part of an argument that a row of the result needs."""
     if isinstance(x, InMemory):
         return x.row(place)
     return x[:1].reshape(x.shape[1:]) if x.ndim == ndim and ndim else x
 
 
 def like_row(equation: JaxprEqn, **params: Any) -> Any:
-    """The same operation of one row."""
+    """Return the same operation for one row."""
     avals: list[Any] = [v.aval for v in equation.outvars]
     rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
@@ -74,11 +74,12 @@ def like_row(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Of products for each row: the first batch axis; of a product with all rows: the first free axis of the left."""
+    """Loop over the first batch axis; without batch axes, over the first free axis of the left argument."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     if not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     a, b = (in_memory(lowering, x) for x in inputs)
+    # Dimension numbers of one row: without the axis that is looped over.
     if left_batch:
         a, b = _first(a, left_batch[0]), _first(b, right_batch[0])
         numbers = (
@@ -90,6 +91,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         if free is None:
             raise Unsupported("a sum of products over a long array")
         a, numbers = _first(a, free), ((_without(left, free), right), ((), ()))
+    # The operation on one row, in a loop.
     item = like_row(equation, dimension_numbers=numbers)
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -100,7 +102,7 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _first(x: InMemory, axis: int) -> InMemory:
-    """With an axis moved to the front."""
+    """Move an axis to the front."""
     order = [axis, *(a for a in range(x.ndim) if a != axis)]
     return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
 
@@ -110,12 +112,13 @@ def _without(axes: tuple[int, ...], removed: int) -> tuple[int, ...]:
 
 
 def _reduction(name: str) -> Rule:
-    """Along the first axis one row after another; along others within each row."""
+    """Make a rule that reduces the first axis row after row, and other axes within each row."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         x, axes = inputs[0], equation.params["axes"]
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
+        # The reduction within a row, and that of two rows.
         inner = tuple(a - 1 for a in axes if a)
         shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
         dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
@@ -127,6 +130,7 @@ def _reduction(name: str) -> Rule:
         def reduced(place: Node) -> np.ndarray:
             return np.asarray(RULES[name](lowering, item, [lowering.nodes(x.row(place))])[0])
 
+        # Rows stay apart, or are accumulated from the neutral element.
         if 0 not in axes:
             return list(repeated(lowering, x.shape[0], [], lambda place, _: ([], [reduced(place)]))[1])
         nothing = np.empty((0, *shape), dtype=object)

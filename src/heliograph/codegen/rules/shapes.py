@@ -1,4 +1,4 @@
-"""Rules of operations that move entries: they rearrange references and make no node."""
+"""Rules of operations that move entries: they rearrange references and make no nodes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ FEW = 16  # places that a number found in the data may choose among, one compari
 
 
 def _moved(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
-    """A rule of one array: function(array, parameters, shape of the result)."""
+    """Make a rule of one array: function(array, parameters, shape of the result)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         return [function(inputs[0], equation.params, result_shape(equation))]
@@ -67,7 +67,7 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """One axis after another, each start clamped so that the slice lies inside."""
+    """Slice one axis after another, each start clamped so that the slice lies inside."""
     x = inputs[0]
     for axis, (start, size) in enumerate(zip(inputs[1:], equation.params["slice_sizes"], strict=True)):
         x = window(lowering.graph, x, axis, lowering.scalar(start), size)
@@ -75,7 +75,7 @@ def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarr
 
 
 def window(graph: Graph, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
-    """`size` entries along an axis from a start that may be data."""
+    """Return `size` entries along an axis from a start that may depend on data."""
     last = x.shape[axis] - size
     if last == 0:
         return x
@@ -116,7 +116,7 @@ def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[n
 def _updated(
     lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
 ) -> np.ndarray:
-    """With an update at known starts, `here` along the axis that has none."""
+    """Apply an update at known starts, `here` along the axis whose start is not known."""
     at = []
     for size, whole, start in zip(update.shape, x.shape, starts, strict=True):
         if start is not None and start.op != "constant" and whole > size:

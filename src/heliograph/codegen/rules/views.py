@@ -1,4 +1,4 @@
-"""Rules of operations on arrays in memory that give another view of the same memory."""
+"""Rules of operations on arrays in memory that return another view of the same memory."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
 
 def _viewed(name: str, view: View) -> Rule:
-    """A rule of one array: its view, or where there is none the rearranged nodes."""
+    """Make a rule of one array: its view, or the rearranged nodes if there is none."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         result = view(inputs[0], equation.params, result_shape(equation))
@@ -78,7 +78,7 @@ def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) 
 
 
 def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
-    """A table, or an array of many entries, in memory, where data or the number of a turn say which are taken."""
+    """Place a table, or a long array, in memory, since data or a loop's counter select its entries."""
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
     if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
         return x
@@ -89,7 +89,7 @@ def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
 
 
 def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
-    """A place between 0 and the last one."""
+    """Clamp a place between 0 and the last one."""
     if start.op == "constant" or last == 0:
         return min(max(int(start.value or 0), 0), last)
     graph = lowering.graph
@@ -100,7 +100,7 @@ def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """x[i, j, ...] of whole rows: a view. Other gathers take the nodes."""
+    """Gather x[i, j, ...] of whole rows as a view; other gathers use nodes."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
     x = indexable(lowering, inputs[0], [indices])
@@ -119,14 +119,14 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
 
 
 def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
-    """Strides of the same entries where axes of length 1 were added."""
+    """Return strides of the same entries with axes of length 1 added."""
     rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
     items = iter(rest)
     return [next(items) if n != 1 else 0 for n in shape]
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Along the first axis into new memory, along another one row after another."""
+    """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     if int(np.prod(shape, dtype=int)) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
@@ -141,7 +141,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
-    """Arrays one after another as one array in memory: one that fills its own memory is written there at once."""
+    """Join arrays into one in memory: an array that fills its own memory is written there directly."""
     graph = lowering.graph
     type = next(x for x in parts if isinstance(x, InMemory)).type
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
@@ -155,7 +155,7 @@ def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> In
 
 
 def _is_alone(x: InMemory, block: Any) -> bool:
-    """Whether an array is all of a buffer that the program fills in this block and that lies nowhere else yet."""
+    """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
     buffer = x.buffer
     whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous(x.shape)
     return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block

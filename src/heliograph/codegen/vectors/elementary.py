@@ -1,8 +1,8 @@
 """Elementary functions of vectors of doubles as text of LLVM IR, each one straight line of operations.
 
-LLVM's own intrinsics call the scalar library once for each number of a vector; these compute all numbers of a vector
-at once. Each is within 2 units of rounding of the true value over its whole range, with NaN, infinities, zeros of both
-signs and denormal numbers as IEEE 754 and JAX have them. The square root and the absolute value need no function.
+LLVM's own intrinsics call the scalar library once for each number of a vector; these compute all numbers of a vector at
+once. Each is within 2 units of rounding of the true value over its whole range, with NaN, infinities, zeros of both
+signs and denormal numbers as in IEEE 754 and JAX. Square root and absolute value need no function.
 
 Source: the reductions and minimax polynomials of Sun's fdlibm, https://www.netlib.org/fdlibm (exp's is a Taylor series
 of one degree more than needed).
@@ -41,11 +41,7 @@ SCALAR = {"pow": 2, "sinh": 1, "cosh": 1, "asinh": 1, "acosh": 1, "atanh": 1, "c
 
 
 def functions(width: int, names: Iterable[str]) -> str:
-    """The text of `define internal <W x double> @hg_NAME(<W x double> ...)` for each name, with what it declares.
-
-    `width` is W; names are those of `FUNCTIONS` and `SCALAR`. Two texts in one module may declare the same intrinsics,
-    which LLVM takes as one.
-    """
+    """Return the text of `define internal <W x double> @hg_NAME(<W x double> ...)` for each name, with declarations."""
     texts, declared = [], set()
     for name in sorted(set(names)):
         text, needs = function(name, width, *FUNCTIONS[name]) if name in FUNCTIONS else _by_number(name, width)
@@ -55,7 +51,7 @@ def functions(width: int, names: Iterable[str]) -> str:
 
 
 def _by_number(name: str, width: int) -> tuple[str, set[str]]:
-    """A function that calls the scalar library for each number."""
+    """Write a function that calls the scalar library for each number."""
     double, count = f"<{width} x double>", SCALAR[name]
     lines, total = [], "poison"
     for lane in range(width):

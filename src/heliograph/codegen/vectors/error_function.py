@@ -1,4 +1,4 @@
-"""The error function, its complement and its inverse on vectors."""
+"""Error function, its complement and its inverse on vectors."""
 
 import math
 
@@ -63,7 +63,7 @@ LOG1P = (
 
 
 def erf(x: Vector) -> Vector:
-    """2 / sqrt(pi) times the integral of e^(-t^2) from 0 to x."""
+    """Compute 2 / sqrt(pi) times the integral of e^(-t^2) from 0 to x."""
     size = abs(x)
     centre, middle, tail = _parts(size)
     outer = select(size < 1.25, AT_ONE + middle, select(size >= 6.0, 1.0, 1 - tail))
@@ -71,7 +71,7 @@ def erf(x: Vector) -> Vector:
 
 
 def erfc(x: Vector) -> Vector:
-    """1 - erf x, precise where it is small."""
+    """Compute 1 - erf x, precise where it is small."""
     size = abs(x)
     centre, middle, tail = _parts(size)
     inner = select(x < 0.25, 1 - fma(x, centre, x), 0.5 - (x - 0.5 + x * centre))
@@ -82,7 +82,7 @@ def erfc(x: Vector) -> Vector:
 
 
 def _parts(size: Vector) -> tuple[Vector, Vector, Vector]:
-    """(erf x - x) / x near 0, erf x - AT_ONE near 1, erfc x beyond: each right where it is used alone."""
+    """Compute (erf x - x) / x near 0, erf x - AT_ONE near 1, erfc x beyond: each valid in its own range."""
     square = size * size
     centre = polynomial(square, CENTRE[0]) / polynomial(square, CENTRE[1])
     # Near 1 and beyond: one rational function whose coefficients and argument depend on where x is.
@@ -102,7 +102,7 @@ def _parts(size: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def erf_inv(x: Vector) -> Vector:
-    """The inverse of erf, by the polynomials of which XLA draws normal numbers; infinite at -1 and 1, NaN beyond."""
+    """Invert erf by XLA's polynomials for normal random numbers; infinite at -1 and 1, NaN beyond."""
     w = -_log1p(-(x * x))
 
     def outer() -> Vector:
@@ -117,7 +117,7 @@ def erf_inv(x: Vector) -> Vector:
 
 
 def _log1p(t: Vector) -> Vector:
-    """log(1 + t) as XLA computes it, so that its draws and these are the same: 53 units of rounding off near -0.4."""
+    """Compute log(1 + t) as XLA does, so that random numbers agree: 53 units of rounding off near -0.4."""
     square = t * t
     cubed = t * square * (polynomial(t, LOG1P[0]) / polynomial(t, LOG1P[1]))
     return select(abs(t) < math.sqrt(2) - 1, t + fma(square, -0.5, cubed), log(1 + t))

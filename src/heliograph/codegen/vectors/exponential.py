@@ -1,4 +1,4 @@
-"""exp, log and their kin on vectors."""
+"""Exponential, logarithm and related functions on vectors."""
 
 import math
 

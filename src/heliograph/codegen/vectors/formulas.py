@@ -1,7 +1,7 @@
-"""Formulas on vectors written down as text of LLVM IR: `a * b + c` on `Vector`s appends the operations to a `Body`.
+"""Formulas on vectors as text of LLVM IR: `a * b + c` on `Vector`s appends operations to a `Body`.
 
 Every function of `vector_math` is one straight line of such operations. Numbers of Python stand for vectors of that
-number. An operation is taken as it is written: no contraction, no reordering; `fma` rounds once.
+number. Operations are written as they stand: no contraction, no reordering; `fma` rounds once.
 """
 
 import struct
@@ -14,7 +14,7 @@ Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of i
 
 @dataclass
 class Body:
-    """The operations of one function on vectors of `width` numbers, and which intrinsics they call."""
+    """Operations of one function on vectors of `width` numbers, and the intrinsics that they call."""
 
     width: int
     lines: list[str] = field(default_factory=list)
@@ -22,17 +22,17 @@ class Body:
     block: str = "entry"
 
     def type(self, scalar: str) -> str:
-        """The type of a vector of these scalars, such as "<8 x double>"."""
+        """Return the type of a vector of these scalars, such as "<8 x double>"."""
         return f"<{self.width} x {scalar}>"
 
     def add(self, scalar: str, operation: str) -> "Vector":
-        """The result of an operation, a vector of these scalars."""
+        """Append an operation; return its result, a vector of these scalars."""
         name = f"%t{len(self.lines)}"
         self.lines.append(f"{name} = {operation}")
         return Vector(self, scalar, name)
 
     def where_any(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
-        """`costly` where needed, else the value: a jump past its operations if no number of the vector needs it."""
+        """Return `costly` where needed, else the value, with a jump past its operations if no lane needs it."""
         start, mark = self.block, len(self.lines)
         truth, double = self.type("i1"), self.type("double")
         reduce = f"@llvm.vector.reduce.or.v{self.width}i1"
@@ -47,7 +47,7 @@ class Body:
         return self.add("double", f"phi {double} [{value.name}, %{start}], [{chosen.name}, %costly{mark}]")
 
     def call(self, intrinsic: str, *args: "Vector") -> "Vector":
-        """The result of an LLVM intrinsic of doubles, such as "fma"."""
+        """Return the result of an LLVM intrinsic of doubles, such as "fma"."""
         double = self.type("double")
         name = f"@llvm.{intrinsic}.v{self.width}f64"
         self.declared.add(f"declare {double} {name}({', '.join([double] * len(args))})")
@@ -64,11 +64,11 @@ class Vector:
 
     @property
     def type(self) -> str:
-        """The vector's type as LLVM writes it."""
+        """Return the vector's type in LLVM."""
         return self.body.type(self.scalar)
 
     def like(self, value: Operand) -> "Vector":
-        """A vector as it is, and a number as a vector of it, of the same type as this one."""
+        """Convert a number to a vector of this type; vectors are returned unchanged."""
         return value if isinstance(value, Vector) else constant(self.body, self.scalar, value)
 
     def _with(self, real: str, whole: str, other: Operand, turned: bool = False) -> "Vector":
@@ -114,7 +114,7 @@ class Vector:
         return self._with("shl", "shl", bits)
 
     def __rshift__(self, bits: Operand) -> "Vector":
-        """Arithmetic shift."""
+        """Shift arithmetically."""
         return self._with("ashr", "ashr", bits)
 
     def __neg__(self) -> "Vector":
@@ -136,7 +136,7 @@ class Vector:
         return self._compared("oge", "sge", other)
 
     def equals(self, other: Operand) -> "Vector":
-        """Where both are equal; false where one is NaN."""
+        """Compare for equality; false for NaN."""
         return self._compared("oeq", "eq", other)
 
     def _compared(self, real: str, whole: str, other: Operand) -> "Vector":
@@ -144,16 +144,16 @@ class Vector:
         return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
 
     def as_type(self, scalar: str) -> "Vector":
-        """The same bits as numbers of another type."""
+        """Reinterpret the bits as another type."""
         return self.body.add(scalar, f"bitcast {self.type} {self.name} to {self.body.type(scalar)}")
 
     def convert(self, how: str, scalar: str) -> "Vector":
-        """The numbers converted by an instruction such as "zext" or "trunc"."""
+        """Convert by an instruction such as "zext" or "trunc"."""
         return self.body.add(scalar, f"{how} {self.type} {self.name} to {self.body.type(scalar)}")
 
 
 def constant(body: Body, scalar: str, value: float) -> Vector:
-    """A vector of one number."""
+    """Return a vector of one number."""
     if scalar == "double":
         text = "0x" + struct.pack(">d", value).hex().upper()
     elif scalar == "i1":
@@ -164,7 +164,7 @@ def constant(body: Body, scalar: str, value: float) -> Vector:
 
 
 def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
-    """`yes` where the condition holds, else `no`; one of them is a vector, or both are real numbers."""
+    """Select `yes` where the condition holds, else `no`; one of them is a vector, or both are real numbers."""
     body = condition.body
     model = next((v for v in (yes, no) if isinstance(v, Vector)), constant(body, "double", 0.0))
     a, b = model.like(yes), model.like(no)
@@ -173,23 +173,23 @@ def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
 
 
 def fma(a: Operand, b: Operand, c: Operand) -> Vector:
-    """a b + c, rounded once; one of them is a vector."""
+    """Compute a b + c, rounded once; one of them is a vector."""
     model = next(v for v in (a, b, c) if isinstance(v, Vector))
     return model.body.call("fma", *(model.like(v) for v in (a, b, c)))
 
 
 def sqrt(x: Vector) -> Vector:
-    """The square root, correctly rounded."""
+    """Compute the square root, correctly rounded."""
     return x.body.call("sqrt", x)
 
 
 def copy_sign(magnitude: Vector, sign: Vector) -> Vector:
-    """|magnitude| with the sign of the other, also that of a zero."""
+    """Return |magnitude| with the sign of the other, also that of a zero."""
     return magnitude.body.call("copysign", magnitude, magnitude.like(sign))
 
 
 def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
-    """c_0 + c_1 x + c_2 x^2 + ... by Horner's rule."""
+    """Evaluate c_0 + c_1 x + c_2 x^2 + ... by Horner's rule."""
     *rest, total = coefficients
     for c in reversed(rest):
         total = fma(x, total, c)
@@ -197,7 +197,7 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
 
 
 def function(name: str, width: int, formula: Callable[..., Vector], arguments: int = 1) -> tuple[str, set[str]]:
-    """The text of an internal function of vectors of doubles, and the declarations it needs."""
+    """Return the text of an internal function of vectors of doubles, and its declarations."""
     body = Body(width)
     double = body.type("double")
     result = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))

@@ -87,7 +87,7 @@ def tan(x: Vector) -> Vector:
 
 
 def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
-    """Quarter turns in x, and what is left as a sum; the first difference is exact."""
+    """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
     quarter, n = _nearest(x * (2 / math.pi))
     first = fma(n, -HALF_PI[0], x)
     # first - n HALF_PI[1] as a sum: the product and the difference each with what rounding takes from it.
@@ -117,7 +117,7 @@ def _cos(x: Vector, low: Vector) -> Vector:
 
 
 def _of_any_size(x: Vector, value: Vector, name: str) -> Vector:
-    """The value where |x| is small enough for it, else that of the scalar library, called where a lane needs it."""
+    """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
     return x.body.where_any(abs(x) >= LARGEST, lambda: x.body.call(name, x), value)
 
 
@@ -179,7 +179,7 @@ def acos(x: Vector) -> Vector:
 
 
 def _asin_parts(size: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-    """Whether |x| < 1/2; s, of which asin s = s + s ratio is asked; and what rounding took from s."""
+    """Return whether |x| < 1/2; s and ratio with asin s = s + s ratio; and the rounding error of s."""
     inner = size < 0.5
     z = select(inner, size * size, (1 - size) * 0.5)
     root = sqrt(z)

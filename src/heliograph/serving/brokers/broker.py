@@ -6,7 +6,12 @@ from heliograph.serving.brokers.url import Address
 
 
 def connected(address: Address, part: Part = WHOLE) -> Transport:
-    """Messages of a part of the plants, through the broker at this address."""
+    """Return the transport for one part of the plants through the broker at this address.
+
+    Args:
+        address: the broker; its `kind`, mqtt or nats, selects the protocol.
+        part: the part of the plants whose messages are read; by default all.
+    """
     if address.kind == "mqtt":
         from heliograph.serving.brokers.mqtt import Mqtt
 

@@ -1,4 +1,4 @@
-"""What a transport must do, shown on a broker: those of the package, and yours."""
+"""Contract test of a transport against a real broker: for the transports of the package, and for your own."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Iterable, Sequence
@@ -11,59 +11,69 @@ from heliograph.serving.output import Output
 
 T = TypeVar("T")
 LONG = 1 << 16  # bytes of one of the messages
-PAUSE = 0.1  # seconds between looks at what was told
+PAUSE = 0.1  # seconds between looks at the published outputs
 
 
 class Broker(Protocol):
     """Both sides of a broker: the service's, and that of a sensor and of a reader, who know nothing of the service."""
 
     def transport(self) -> Transport:
-        """The service's side, made anew, as after a restart."""
+        """Make the service's side anew, as after a restart."""
 
     async def send(self, bodies: Sequence[bytes]) -> None:
         """Send messages as a sensor does, in order; return when the broker has them."""
 
     async def published(self) -> Sequence[bytes]:
-        """The bodies of all outputs that a reader has heard so far, in order."""
+        """Return the bodies of all outputs that a reader has received so far, in order."""
 
 
 def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0) -> bool:
-    """Check the contract of a transport on a broker under which nothing was sent yet.
+    """Check the contract of a transport on a broker to which nothing has been sent yet.
 
-    Messages come whole and in order, and `receive` waits for them, until it is cancelled. What was acknowledged does
-    not come again after a restart; what was not comes again, with what was sent while nobody read. What has a number is
-    at the broker, in order, when `publish` returns. Nothing takes longer than `patience` seconds. Copies may come, and
-    what was sent before the first transport listened may be lost.
+    Messages arrive complete and in order, and `receive` waits for them until it is cancelled. A message that was
+    acknowledged is not delivered again after a restart; one that was not is delivered again, together with what was
+    sent while nobody was reading. Outputs that have a number are at the broker, in order, when `publish` returns.
+    Copies may arrive, and what was sent before the first transport listened may be lost.
 
-    Returns whether what comes again comes in order. If not, the window of a service has to be longer than that takes.
+    Args:
+        broker: both sides of the broker to examine.
+        messages: number of messages sent in each part of the check.
+        patience: seconds that a single call may take at most.
+
+    Returns:
+        Whether redelivered messages arrive in order. If not, the window of a service has to be longer than a redelivery
+        takes.
 
     Raises:
-        AssertionError: naming what does not hold.
+        AssertionError: naming the promise that does not hold.
     """
     return asyncio.run(_Check(broker, messages, patience).all())
 
 
 class _Check:
-    """One broker's examination."""
+    """State of one examination of a broker."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):
         self.broker, self.messages, self.patience = broker, messages, patience
-        self.silence = patience / 20  # as long nothing comes where there is nothing
+        self.silence = patience / 20  # seconds without a message after which we assume that there is none
         self._numbers = count()
 
     async def all(self) -> bool:
-        """Each promise in turn, to one service after another."""
+        """Check each promise in turn, with one service after another."""
+        # First service: new messages arrive in order, and all are acknowledged.
         async with self._service() as transport:
             await self._listening(transport)
             sent = await self._sent()
             assert await self._until(transport, sent) == sent, "receive: expected new messages in order"
             await self._silent(transport)
         async with self._service() as transport:
+            # Second service: none of them arrives again; half of the next messages are left unacknowledged.
             again = await self._for_a_while(transport)
             assert not again, f"acknowledge: expected nothing to come again, got {len(again)} messages"
             sent = await self._sent()
             await self._until(transport, sent[: len(sent) // 2], acknowledge=False)
             await self._for_a_while(transport)
+        # Third service: these arrive again, with those that were sent while nobody was reading.
         sent += await self._sent()
         async with self._service() as transport:
             result = await self._until(transport, sent)
@@ -73,7 +83,7 @@ class _Check:
 
     @asynccontextmanager
     async def _service(self) -> AsyncIterator[Transport]:
-        """A transport until it is closed."""
+        """Open a transport for a block, and close it at the end."""
         transport = self.broker.transport()
         try:
             yield transport
@@ -81,7 +91,7 @@ class _Check:
             await self._soon("close", transport.close())
 
     async def _listening(self, transport: Transport) -> None:
-        """Greet until the service hears: before its first start a broker may keep nothing."""
+        """Send greetings until the service receives one: before its first start a broker may store nothing."""
         greeting = self._bodies(1)
         observation = asyncio.ensure_future(self._until(transport, greeting))
         while not observation.done():
@@ -91,7 +101,7 @@ class _Check:
         await self._silent(transport)
 
     async def _published(self) -> None:
-        """Closing right after `publish` loses nothing that has a number."""
+        """Check that closing right after `publish` loses no output that has a number."""
         outputs = [Output(i, "a.b", "final", body) for i, body in enumerate(self._bodies(self.messages), 1)]
         now = Output(None, "a.b", "provisional", b"now")
         async with self._service() as transport:
@@ -114,7 +124,7 @@ class _Check:
         return bodies
 
     async def _until(self, transport: Transport, bodies: Sequence[bytes], acknowledge: bool = True) -> list[bytes]:
-        """Receive until all of these have come; each once, in the order in which they came first."""
+        """Receive until all of these bodies have arrived; return each once, in the order of first arrival."""
         result = list[bytes]()
 
         async def listen() -> None:
@@ -130,14 +140,14 @@ class _Check:
         return _once(result)
 
     async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
-        """What comes until the wait is cancelled."""
+        """Receive for `silence` seconds, then cancel; return the bodies that arrived."""
         try:
             return await self._taken(await asyncio.wait_for(transport.receive(), self.silence), acknowledge)
         except TimeoutError:
             return []
 
     async def _silent(self, transport: Transport) -> None:
-        """Take copies of what was acknowledged late, until none come."""
+        """Receive and acknowledge late copies until none arrive."""
         while await self._for_a_while(transport, acknowledge=True):
             pass
 
@@ -155,7 +165,7 @@ class _Check:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
     def _bodies(self, count_: int) -> list[bytes]:
-        """Bodies that were not sent before; the first is long."""
+        """Make bodies that were not sent before; the first is long."""
         return [
             b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(count_)
         ]

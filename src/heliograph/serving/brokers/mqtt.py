@@ -21,11 +21,12 @@ AT_LEAST_ONCE = 1
 
 
 class Mqtt:
-    """The messages under TOPIC/in, or under TOPIC/in/PART of those shared; outputs go to TOPIC/out/KIND/PLANT.
+    """Transport over MQTT: messages under TOPIC/in, or TOPIC/in/PART if shared; outputs to TOPIC/out/KIND/PLANT.
 
-    The session is the part's, not the process's: who reads a part next takes over its session, and with it what was
-    not acknowledged. A broker closes the connection of the one before. Version 3.1.1, which every broker speaks.
-    Reading and writing have a connection each: reading may have to wait while something is written.
+    The session belongs to the part, not to the process: whoever reads a part next takes over its session, and with it
+    the messages that were not acknowledged. The broker closes the connection of the previous reader. We speak version
+    3.1.1, which every broker supports. Reading and writing have a connection each, since reading may have to wait while
+    something is written.
     """
 
     def __init__(self, address: Address, part: Part = WHOLE):
@@ -44,7 +45,7 @@ class Mqtt:
 
 
 class _Connection:
-    """A connection that is made anew whenever it ends, after a wait that doubles; callbacks come in its own thread."""
+    """A connection that is opened anew whenever it ends, after a wait that doubles; callbacks run in its thread."""
 
     def __init__(self, address: Address, identity: str):
         self.address, self.open = address, True
@@ -78,7 +79,7 @@ class _Connection:
             LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
 
     def failed(self, client: Client, data: object) -> None:
-        """Nobody answers there, or nobody who is trusted."""
+        """Report that nobody answers there, or nobody who is trusted."""
         if self.open:
             LOG.warning("%s: no connection; trying again", self.address)
 
@@ -91,7 +92,7 @@ class _Connection:
 
 
 class _Reader(_Connection):
-    """What comes, until it is taken."""
+    """Connection that receives messages and holds them until `receive` takes them."""
 
     def __init__(self, address: Address, part: Part):
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
@@ -120,7 +121,7 @@ class _Reader(_Connection):
         return Batch([bytes(message.payload) for _, message in batch], acknowledge)
 
     def _on_message(self, client: Client, data: object, message: MQTTMessage) -> None:
-        """Nothing more is read while too much waits here."""
+        """Hold a message; while too many are held, block the client's thread so that no more are read."""
         with self.room:
             self.room.wait_for(lambda: len(self._held) < HELD or not self.open)
             self._held.append((self._connection, message))
@@ -141,7 +142,7 @@ class _Reader(_Connection):
 
 
 class _Writer(_Connection):
-    """What goes out."""
+    """Connection that publishes outputs."""
 
     def __init__(self, address: Address):
         super().__init__(address, "")
@@ -150,7 +151,7 @@ class _Writer(_Connection):
         self.start()
 
     def tell(self, outputs: Sequence[Output]) -> None:
-        """Return when the broker has all that has a number; a provisional estimate, which the next replaces, may go."""
+        """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
         sent = set()
         for output in outputs:
             topic = f"{self.address.topic}/out/{output.kind}/{word(output.plant)}"

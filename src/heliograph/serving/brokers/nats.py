@@ -40,11 +40,12 @@ T = TypeVar("T")
 
 
 class Nats:
-    """The messages of TOPIC.in.PLANT, as stream TOPIC keeps them; outputs go to TOPIC.out.KIND.PLANT and are kept too.
+    """Transport over NATS JetStream: stream TOPIC stores TOPIC.in.PLANT; outputs go to TOPIC.out.KIND.PLANT.
 
-    A server that redelivers sends what is new first, and what is late might by then be too late. So nothing is ever
-    redelivered: each reader, and each connection anew, makes a consumer that begins after the last acknowledged
-    message, and removes the one before. One acknowledgement says that everything up to a message is kept.
+    A server that redelivers sends new messages first, and the redelivered ones might by then be too late. So nothing is
+    ever redelivered: each reader, and each new connection, makes a consumer that begins after the last acknowledged
+    message, and removes the previous one. One acknowledgement covers everything up to its message. Outputs that have a
+    number are stored too.
     """
 
     def __init__(self, address: Address, part: Part = WHOLE):
@@ -60,6 +61,7 @@ class Nats:
     async def receive(self) -> Batch | None:
         while True:
             still_needed()
+            # A request that times out is repeated; a broken connection gets a new consumer.
             reader = await self._persist(self._reading)
             try:
                 messages = await reader.fetch(MOST, WAIT)
@@ -71,6 +73,8 @@ class Nats:
                 continue
             if not messages:  # none came meanwhile, or the connection broke, which `_reading` sees
                 continue
+            # The consumer counts what it sends: a gap means that messages were lost, and we read again from the last
+            # one that was acknowledged.
             count = messages[-1].metadata.sequence.consumer
             if count != self._read + len(messages):  # some were lost on the way here
                 self._reader = None
@@ -79,7 +83,7 @@ class Nats:
             return Batch([message.data for message in messages], partial(self._solve_steady, messages[-1]))
 
     async def _solve_steady(self, last: Msg) -> None:
-        """Everything up to this message is kept; if the server does not hear of it they come again, as duplicates."""
+        """Acknowledge everything up to this message; if the server misses it, the messages come again as duplicates."""
         self._acknowledged = last.metadata.sequence.stream
         with contextlib.suppress(*AWAY):
             await last.ack_sync()
@@ -94,7 +98,7 @@ class Nats:
                 await asyncio.wait_for(self._client.close(), WAIT)
 
     async def _tell(self, outputs: Sequence[Output]) -> None:
-        """Provisional estimates as they pass; what has a number stays, once, if it is told again soon."""
+        """Publish provisional estimates without storage; store outputs that have a number, without duplicates."""
         server, stored = await self._open(), []
         for output in outputs:
             subject = f"{self.topic}.out.{output.kind}.{word(output.plant)}"
@@ -106,7 +110,7 @@ class Nats:
         await asyncio.wait_for(asyncio.gather(*stored), ANSWER)
 
     async def _persist(self, act: Callable[[], Awaitable[T]]) -> T:
-        """Do it, however long the server is away."""
+        """Await an action, and repeat it for as long as the server is away."""
         while True:
             try:
                 done = await act()
@@ -120,10 +124,11 @@ class Nats:
         return self._client.is_connected
 
     async def _open(self) -> JetStreamContext:
-        """The connection, made anew where it broke."""
+        """Return the connection, opened anew if it is broken."""
         async with self._opening:
             if self._server is not None and self._client.is_connected:
                 return self._server
+            # Connect without the client's reconnection, after which messages would arrive out of order.
             await self.close()
             self._client, self._server, self._reader = Client(), None, None
             await self._client.connect(
@@ -136,6 +141,7 @@ class Nats:
                 allow_reconnect=False,
                 connect_timeout=5,
             )
+            # The stream of outputs that are published exactly once.
             server = self._client.jetstream(timeout=ANSWER)
             subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
             await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=RETENTION))
@@ -143,18 +149,21 @@ class Nats:
             return server
 
     async def _reading(self) -> JetStreamContext.PullSubscription:
-        """A consumer of this part that begins after what was acknowledged; others of the part are removed."""
+        """Return a consumer of this part that begins after the last acknowledged message; remove all others."""
         if self._reader is not None and self._connected():
             return self._reader
         server = await self._open()
         newest = await self._made(server)
+        # Another process has taken over this part if our consumer is gone and there is another.
         mine = f"part-{self.part.number}-of-{self.part.of}-"
         others = [c for c in await server.consumers_info(self.stream) if c.name.startswith(mine)]
         if self._name and others and self._name not in [c.name for c in others]:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
+        # Begin after the last message that any reader acknowledged.
         floors = [c.ack_floor.stream_seq for c in others if c.ack_floor is not None]
         begun = self._acknowledged if others else 0  # a stream without its consumers is a new one
         self._acknowledged = min(max([begun, *floors]), newest)
+        # Make the new consumer before the others are removed.
         self._name, self._read = mine + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)
@@ -174,9 +183,12 @@ class Nats:
         )
 
     async def _made(self, server: JetStreamContext) -> int:
-        """The stream of messages, if it is not there yet, and the number of the last one.
+        """Make the stream of messages if there is none; return the number of its last message.
 
         The server itself writes a plant's part into the subject.
+
+        Raises:
+            ValueError: the stream exists with another number of parts.
         """
         source, parts = f"{self.topic}.in.*", self.part.of
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
@@ -190,7 +202,7 @@ class Nats:
 
 
 async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
-    """The stream of this name as it is, made if there is none."""
+    """Return the stream of this name, made if there is none."""
     try:
         return await server.stream_info(str(expected.name))
     except NotFoundError:
@@ -198,4 +210,4 @@ async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInf
 
 
 async def _silent(_: Exception) -> None:
-    """What goes wrong is raised where it is waited for."""
+    """Ignore errors of the client's background tasks: they are raised again where we await them."""

@@ -1,4 +1,4 @@
-"""Lines of JSON through pipes: whatever is there is a batch; a reader that is slow slows the sender."""
+"""Transport over pipes, a message a line: all lines that are there form a batch; a slow reader slows the sender."""
 
 import asyncio
 import os
@@ -14,9 +14,13 @@ AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
 class Pipe:
-    """Messages from one file descriptor, outputs to another, one a line. An empty line says nothing.
+    """Messages from one file descriptor, outputs to another, one a line. Empty lines are ignored.
 
-    A line that does not end within LONGEST bytes is given as it is so far, and what follows of it is passed over.
+    A line longer than LONGEST bytes is cut there, and the rest of it is skipped.
+
+    Args:
+        source: file descriptor of the messages (default 0, standard input).
+        target: file descriptor of the outputs (default 1, standard output).
     """
 
     def __init__(self, source: int = 0, target: int = 1):
@@ -35,7 +39,7 @@ class Pipe:
                 return None
 
     def _lines(self, data: bytes) -> list[bytes]:
-        """The lines that are whole with these bytes; at the end, without any, what is left."""
+        """Return the lines that are complete with these bytes; at the end of the file, the incomplete last one."""
         *lines, rest = (self._rest + data).split(b"\n") if data else [self._rest, b""]
         if self._skipping and lines:
             del lines[0]
@@ -56,11 +60,11 @@ class Pipe:
                 rest = rest[os.write(self.target, rest[:AT_ONCE]) :]
 
     async def close(self) -> None:
-        """Nothing to do: whoever opened the files closes them."""
+        """Do nothing: whoever opened the files closes them."""
 
 
 async def _ready(file: int, add: Callable[[int, Callable[[], None]], None], remove: Callable[[int], object]) -> None:
-    """Wait until a file can be used without waiting, so that the wait itself can be cancelled."""
+    """Wait until a file can be used without blocking, so that the wait itself can be cancelled."""
     ready = asyncio.Event()
     try:
         add(file, ready.set)

@@ -1,4 +1,4 @@
-"""A recording as the messages that its nodes would have sent, and what a link does to them on their way."""
+"""Replay of a recording: the messages that its nodes would have sent, and the effects of a link on them."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -19,10 +19,13 @@ DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where
 
 
 class Link(NamedTuple):
-    """What may happen to a message on its way.
+    """Statistical model of what happens to a message between a node and the service.
 
-    It is lost with probability `loss`, in runs of `run` on average; on its way for a time with the exponential law of
-    mean `delay`; heard twice with probability `duplicates`.
+    Args:
+        loss: probability that a message is lost (default 0).
+        run: mean number of consecutive losses (default 1: losses are independent).
+        delay: mean delay, exponentially distributed, in the unit of time of the events (default 0).
+        duplicates: probability that a message arrives twice (default 0).
     """
 
     loss: float = 0.0
@@ -32,10 +35,17 @@ class Link(NamedTuple):
 
 
 def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 | None]:
-    """Events of a file, of rows or of events already, by the time at which they were heard; the moment of time 0.
+    """Read the events of a file, of rows or of events, in order of arrival, and the date of time 0.
 
-    Of a row its measurements are events; the inputs that lead to it are known a row before where time is continuous,
-    since there an input holds from its event on.
+    Each row's measurements become events. In continuous time an input holds from its event on, so the inputs of a row
+    are dated at the row before.
+
+    Args:
+        path: the file.
+        network: the network that the columns belong to.
+
+    Returns:
+        The events, and the date from which their times are counted (None if times are numbers or steps).
 
     Raises:
         ValueError: what reading the file refuses.
@@ -44,6 +54,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     instance("network", network, Network, "a Network")
     if holds_events(path):
         return read_events(path, network)
+    # Time of each row: its index if the network counts steps, else seconds.
     table = read_recording(path, network)
     dated = table.time.dtype.kind == "M"
     origin = table.time[0] if dated else None
@@ -51,6 +62,7 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
     local = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
+    # An event for the inputs of each row, and for each node that measured something in it.
     events = []
     for k, at in enumerate(time.tolist()):
         if local and (steps or k):
@@ -61,17 +73,25 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
 
 
 def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
-    """What arrives of events, in the order of arrival; inputs arrive as they are sent.
+    """Simulate a link: return the events that arrive, in order of arrival. Inputs arrive at once and are never lost.
+
+    Losses form a two-state Markov chain per node: P(loss | loss) = 1 - 1/run, and P(loss | no loss) such that the
+    stationary probability is `loss`.
+
+    Args:
+        events: the events as they are sent.
+        link: the model of the link.
+        seed: seed of the random numbers, not negative.
 
     Raises:
-        ValueError: a probability that is none, a negative delay, a run shorter than 1 or than losses of this
-            probability can be.
+        ValueError: no probability, a negative delay, a run shorter than 1 or than losses of this probability can be.
     """
     instance("link", link, Link, "a Link")
     events = items("events", events, "events")
     chance = np.random.default_rng(check_seed("seed", seed))
     loss, twice = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)
     scalar("delay", link.delay, 0, FAR)
+    # Markov chain of losses with stationary probability pi = loss: P(loss | no loss) = pi P(no loss | loss) / (1 - pi).
     stays = 1 - 1 / scalar("run", link.run, 1)  # lost again after a loss
     falls = 1.0 if loss == 1 else loss * (1 - stays) / (1 - loss) if link.run > 1 else loss
     if falls > 1:
@@ -81,6 +101,7 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
         if event.node == INPUTS:
             result.append(_arriving(event, 0.0))
             continue
+        # The first state of the chain is drawn from the stationary law.
         before = lost.get(event.node, chance.random() < loss)
         now = chance.random() < (stays if before and link.run > 1 else falls)
         lost[event.node] = now
@@ -90,7 +111,14 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
 
 
 def along(events: Sequence[Event], trace: Path) -> list[Event]:
-    """What arrives of events if their delays are those of a recorded trace, one row a message, again from the first.
+    """Delay events as in a recorded trace, and return those that arrive, in order of arrival.
+
+    The trace has one row for each message, and is repeated from its start if there are more messages. Inputs arrive at
+    once.
+
+    Args:
+        events: the events as they are sent.
+        trace: a file with a column `delay`, in the unit of time of the events; NaN where a message was lost.
 
     Raises:
         ValueError: no column `delay`, or a negative one.
@@ -109,7 +137,16 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
 
 
 def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
-    """Each event as a message, with the time at which it is heard."""
+    """Encode each event as a message, with the time of its arrival.
+
+    Args:
+        events: the events, in order of arrival.
+        plant: name of the plant; may be empty.
+        origin: date of time 0; None if times are numbers.
+
+    Returns:
+        Pairs of the arrival time and the line of JSON.
+    """
     for event in events:
         arrival = event.time if event.arrival is None else event.arrival
         values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]

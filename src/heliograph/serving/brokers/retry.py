@@ -1,4 +1,4 @@
-"""Trying again, later each time: a broker that went away is not asked a hundred times a second."""
+"""Repeated attempts with waits that grow, so that an absent broker is not contacted a hundred times a second."""
 
 import asyncio
 import logging
@@ -9,11 +9,7 @@ FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
 def still_needed() -> None:
-    """Go on cancelling what was cancelled: a client may take it for the end of a wait of its own, and return.
-
-    Raises:
-        CancelledError: the task was cancelled.
-    """
+    """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
@@ -26,7 +22,7 @@ class Retry:
         self.what, self._wait = what, FIRST
 
     async def wait(self, error: Exception) -> None:
-        """Say what failed, and wait before the next try."""
+        """Log the failure, and wait before the next attempt."""
         still_needed()
         wait = self._wait * random.uniform(0.5, 1.0)
         LOG.warning("%s: %s; trying again in %.1f s", self.what, type(error).__name__, wait)
@@ -34,5 +30,5 @@ class Retry:
         await asyncio.sleep(wait)
 
     def worked(self) -> None:
-        """The next failure is a first one again."""
+        """Reset the wait after a success."""
         self._wait = FIRST

@@ -1,4 +1,4 @@
-"""How messages travel: what a pipe and each broker does, and no more."""
+"""Interface of a transport: how messages reach a service and outputs leave it."""
 
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
@@ -8,31 +8,36 @@ from heliograph.serving.output import Output
 
 
 class Batch(NamedTuple):
-    """Messages that were received together, and what tells their sender that they are kept: after the commit."""
+    """Messages that were received together.
+
+    Args:
+        payloads: the messages, each a line of JSON.
+        acknowledge: to be awaited after the commit; it tells the sender that the messages are stored.
+    """
 
     payloads: Sequence[bytes]
     acknowledge: Callable[[], Awaitable[None]]
 
 
 class TakenOverError(InputError):
-    """Another process reads these messages now."""
+    """Loss of the messages to another process, which reads them now."""
 
 
 class Transport(Protocol):
-    """Messages in, outputs out. What was not acknowledged may come again; what is published may be told again."""
+    """Messages in, outputs out. A message that was not acknowledged may come again; an output may be sent twice."""
 
     async def receive(self) -> Batch | None:
-        """Wait for messages and take those that are there, a bounded number; None at the end.
+        """Wait for messages and return those that are there, a bounded number; None at the end.
 
-        It may be cancelled while it waits: what it had not returned is not acknowledged.
+        It may be cancelled while it waits: messages that it has not returned are not acknowledged.
         """
 
     async def publish(self, outputs: Sequence[Output]) -> None:
-        """Hand outputs on, in order; return when they are out, which a slow reader may delay."""
+        """Send outputs, in order; return when they have left, which a slow reader may delay."""
 
     async def close(self) -> None:
-        """Let go of what it holds."""
+        """Release the resources of the transport."""
 
 
 async def nothing() -> None:
-    """Acknowledge to a sender that does not ask."""
+    """Acknowledge to a sender that expects no answer."""

@@ -1,4 +1,4 @@
-"""Where a broker is and how to speak to it: a URL, and what the environment adds; what is secret is never shown."""
+"""Broker addresses: a URL, completed by environment variables; secrets are never printed."""
 
 import os
 import ssl
@@ -17,9 +17,16 @@ CERTIFICATE, KEY = "HELIOGRAPH_BROKER_CERTIFICATE", "HELIOGRAPH_BROKER_KEY"
 
 @dataclass(frozen=True)
 class Address:
-    """A broker: its kind (mqtt or nats), host, port, and the topic under which the messages of a service are.
+    """Address of a broker; printed it is the URL without user and password.
 
-    Printed it is the URL without user and password.
+    Args:
+        kind: "mqtt" or "nats".
+        host: name or address of the machine.
+        port: port number.
+        topic: topic under which a service's messages are.
+        secure: whether the connection uses TLS.
+        user: user name, or token of a NATS server without passwords; None if the broker asks for none.
+        password: password of the user.
     """
 
     kind: str
@@ -34,9 +41,9 @@ class Address:
         return f"{self.kind}{'+tls' if self.secure else ''}://{self.host}:{self.port}/{self.topic}"
 
     def tls(self) -> ssl.SSLContext | None:
-        """What a secure connection needs; the authorities are the system's, or those of the file SSL_CERT_FILE.
+        """Return the TLS context, with the system's authorities or those of the file SSL_CERT_FILE; None if not secure.
 
-        A certificate of our own is in the files that HELIOGRAPH_BROKER_CERTIFICATE and HELIOGRAPH_BROKER_KEY name.
+        A client certificate is read from the files that HELIOGRAPH_BROKER_CERTIFICATE and HELIOGRAPH_BROKER_KEY name.
         """
         if not self.secure:
             return None
@@ -49,15 +56,21 @@ class Address:
 def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
     """A broker's URL: `mqtt`, `mqtts`, `nats` or `nats+tls`, ://user:password@host:port/topic; the host must be there.
 
-    User and password may also be in HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD, which come before the URL's,
-    where other users of the machine would see them.
+    User and password are taken from HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD if these are set, since other
+    users of the machine would see them in a URL.
+
+    Args:
+        url: SCHEME://user:password@host:port/topic, where SCHEME is `mqtt`, `mqtts`, `nats` or `nats+tls`; only scheme
+            and host are required.
+        environment: environment variables; by default those of the process.
 
     Raises:
-        ValueError: another kind of URL, no host, a topic with wildcards. It never tells the password.
+        ValueError: another kind of URL, no host, a topic with wildcards. The message contains no password.
     """
     text("broker", url)
     environment = table("environment", os.environ if environment is None else environment, "texts")
     shape = f"{', '.join(f'{scheme}://' for scheme in PORTS)} and host:port/topic"
+    # Scheme, host and port; nothing of a URL that cannot be read is printed, since it may contain a password.
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -65,6 +78,7 @@ def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
         raise fail("broker", shape, "an address that cannot be read") from None
     if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
         raise fail("broker", shape, f"{parts.scheme}://{host or ''}")
+    # Words of the topic must be valid in MQTT and NATS.
     topic = unquote(parts.path).strip("/") or TOPIC
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)

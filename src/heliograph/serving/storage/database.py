@@ -12,10 +12,10 @@ PLACE = "a file, or a URL as postgresql://host/database"
 
 
 def engine_at(place: str) -> Engine:
-    """Open the database of a store.
+    """Open the database of a store, at a path (SQLite) or a URL (PostgreSQL).
 
     Raises:
-        ValueError: no path, or the URL of another kind of database; it never tells a password.
+        ValueError: no path, or the URL of another kind of database; the message contains no password.
     """
     engine = create_engine(url_of(place))
     if engine.dialect.name == "sqlite":
@@ -43,13 +43,13 @@ def url_of(place: str) -> URL:
 
 
 def _durably(connection: Any, _: object) -> None:
-    """Each commit is on the disk before it returns; readers do not wait for it."""
+    """Configure SQLite: each commit is on the disk before it returns, and readers do not wait for writers."""
     connection.isolation_level = None  # transactions begin where the engine says so
-    connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can be told
+    connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can still be printed
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
         connection.execute(f"PRAGMA {pragma}")
 
 
 def _at_once(connection: Connection) -> None:
-    """A transaction that will write waits for others before it reads."""
+    """Begin a transaction with the write lock, so that it never has to upgrade a read lock."""
     connection.exec_driver_sql("BEGIN IMMEDIATE")

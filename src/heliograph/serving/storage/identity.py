@@ -1,4 +1,4 @@
-"""What a network is to a store: a state goes on only where everything computes as it did."""
+"""Identity of a network for a store: a stored state may only continue where everything is computed as before."""
 
 from heliograph.live.identity import Identity, network_identity
 from heliograph.numerics.check import instance
@@ -6,6 +6,10 @@ from heliograph.serving.fleet import Fleet
 
 
 def identity(fleet: Fleet) -> Identity:
-    """What a store has to be of, to go on with this fleet: its network, its compiled program and its options."""
+    """Return what a store must agree with to continue this fleet: its network, compiled program and options.
+
+    Args:
+        fleet: the fleet whose plants the store keeps.
+    """
     instance("fleet", fleet, Fleet, "a Fleet")
     return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict())

@@ -1,4 +1,4 @@
-"""In place of a store: nothing outlives the process, and plants stay in memory."""
+"""Store in memory: nothing outlives the process."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -7,7 +7,7 @@ from heliograph.serving.storage.store_protocol import Entry, StoredPlant
 
 
 class InMemoryStore:
-    """Numbers what is told, and keeps nothing."""
+    """Store that numbers outputs and keeps nothing; the plants stay in the memory of the service."""
 
     keeps, name = False, "memory"
 
@@ -15,24 +15,24 @@ class InMemoryStore:
         self._number = 0
 
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
-        """Nothing is kept."""
+        """Return no plants: none are stored."""
         return {}
 
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Number what is to be told."""
+        """Number the outputs, counting from 1."""
         begin = self._number + 1
         self._number += len(entries)
         return [entry.numbered(number) for number, entry in enumerate(entries, begin)]
 
     def unpublished(self) -> list[Output]:
-        """Nothing was kept."""
+        """Return no outputs: none are stored."""
         return []
 
     def count(self) -> int:
-        """Nothing is kept."""
+        """Return 0: no plants are stored."""
         return 0
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: the store holds no resources."""

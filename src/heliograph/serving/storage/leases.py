@@ -1,4 +1,4 @@
-"""Which process reads which part of the plants: leases in the database that keeps the plants."""
+"""Leases of the parts of the plants to processes, in the database that keeps the plants."""
 
 from sqlalchemy import Column, Connection, Float, Integer, MetaData, String, Table, delete, select, text
 from sqlalchemy.dialects import postgresql, sqlite
@@ -21,10 +21,10 @@ TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts
 
 
 class Leases:
-    """A process's share of `parts`: all that live have as many, or one more.
+    """A process's share of `parts` parts: all live processes have equally many, up to one.
 
-    A lease makes it likely that one process reads a part at a time, which keeps messages in order; that no message is
-    used twice does not rest on it, nor on clocks: a plant's commit fails if another was made since it was read.
+    A lease makes it likely that one process reads a part at a time, which keeps messages in order. That no message is
+    used twice does not depend on leases or clocks: the commit of a plant fails if another was made since it was read.
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
@@ -34,7 +34,7 @@ class Leases:
         TABLES.create_all(engine)
 
     def renew(self) -> set[int]:
-        """Say that this process lives, and lease its parts anew: those that it keeps and those that nobody has."""
+        """Report that this process is alive, and lease its parts anew: those that it has and those that are free."""
         with self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
             fair = self._fair(connection, now)
@@ -47,18 +47,18 @@ class Leases:
             return {number for number in expected if self._lease(connection, number, now)}
 
     def release(self, number: int) -> None:
-        """Leave a part to others."""
+        """Release one part to other processes."""
         with self.engine.begin() as connection:
             connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
 
     def leave(self) -> None:
-        """Leave everything to others."""
+        """Release everything to other processes."""
         with self.engine.begin() as connection:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 
     def _fair(self, connection: Connection, now: float) -> int:
-        """How many parts are this process's, which lives; those left over are the first ones' by name."""
+        """Return how many parts this process should have; the remainder goes to the first processes by name."""
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
@@ -67,7 +67,7 @@ class Leases:
         return items + (alive.index(self.process) < over)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
-        """Whether the part is ours: it was, or its lease was over."""
+        """Lease a part if it is ours or free; return whether it is ours now."""
         mine = {"process": self.process, "until": now + self.term}
         new = self._insert(PARTS).values(number=number, **mine)
         free = (PARTS.c.until < now) | (PARTS.c.process == self.process)

@@ -1,4 +1,4 @@
-"""A plant as bytes, and again as a plant: the same bits go on."""
+"""Serialisation of a plant: bytes that restore the same bits."""
 
 import json
 import struct
@@ -15,17 +15,19 @@ HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events
 
 
 def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
-    """All that is held of a plant that was settled: a head of JSON, whole numbers, doubles."""
+    """Serialise a plant that has no pending changes: a head of JSON, then integers, then doubles."""
     rows = plant.rows.held
     origin = None if plant.origin is None else plant.origin.isoformat()
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
     head = to_json({"now": plant.now, "forced": plant.forced, "origin": origin, "links": links})
+    # Integers: step numbers of the rows, then (row, node, count) of each event.
     events = [(i, name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
     whole = [number for row in rows for number in row.key[1:]]
     whole += [number for i, name, _ in events for number in (i, name[0], name[1])]
     values = np.concatenate([np.zeros(0), *(values for _, _, values in events)])
     return b"".join(
         [
+            # Lengths of the parts, then the parts: head, integers, rows, times and values of events.
             HEAD.pack(len(head), len(rows), len(events), len(values)),
             head,
             np.array(whole, dtype="<i8").tobytes(),
@@ -37,9 +39,10 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
 
 
 def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
-    """The plant again, its rows in slots of the fleet's table."""
+    """Restore a plant from bytes, with its rows in slots of the fleet's table."""
     length, count, received, numbers = HEAD.unpack_from(data)
     head, at = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length
+    # The parts in the order in which `plant_bytes` writes them.
     whole = np.frombuffer(data, "<i8", 2 * count + 3 * received, at).tolist()
     at += 8 * len(whole)
     width = fleet.pool.table.shape[1]
@@ -47,6 +50,7 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     at += 8 * table.size
     times = np.frombuffer(data, "<f8", received, at).tolist()
     values = np.frombuffer(data, "<f8", numbers, at + 8 * received)
+    # Rows, each in a new slot; then their events.
     rows = [_row(fleet, table[i], whole[2 * i], whole[2 * i + 1]) for i in range(count)]
     begin = 0
     for time, i, place, sequence in zip(times, *(whole[2 * count + j :: 3] for j in range(3)), strict=True):

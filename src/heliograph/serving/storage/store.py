@@ -1,4 +1,4 @@
-"""Where the state is kept: plants, what was told of them, and how far, in one transaction for each batch."""
+"""Store of a service's state: plants, outputs and progress of publication, in one transaction for each batch."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -34,13 +34,18 @@ MEND = "its plants go on in a new store with --store NEW --from-snapshot"
 
 
 class Store:
-    """Plants and the journal in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
+    """Plants and a journal of outputs in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
 
-    The journal keeps the last `journal` entries and some more. Where a plant was committed by another process since it
-    was read, nothing is committed.
+    If a plant was committed by another process since it was read, nothing is committed. Every row has a checksum;
+    `damaged` are the plants with rows that are not as written. A new name may belong to one of them if its name is
+    damaged.
 
-    Every row has a checksum. `damaged` are the plants whose rows are not what was written; a new name may be that of
-    one of them where its name is damaged too. `opened`: a store open on the same place, which has looked for them.
+    Args:
+        place: a path, or a URL of PostgreSQL.
+        mine: identity of the network, which a stored state must agree with (`identity`).
+        process: name of this process in the journal; empty if there is only one.
+        journal: number of outputs that the journal keeps at least (default 100,000).
+        opened: a store open on the same place, which has already looked for damage.
 
     Raises:
         ValueError: a place that cannot be opened; a database that is damaged as a whole; the state of another network,
@@ -66,7 +71,7 @@ class Store:
 
     @contextmanager
     def _saying(self, expected: str) -> Iterator[None]:
-        """Have what the database says in the one line of an error that names the store."""
+        """Turn errors of the database into one line that names the store."""
         try:
             yield
         except UnicodeError:  # of a damaged one: the database's own complaint cites it
@@ -76,12 +81,14 @@ class Store:
             raise fail(f"store {self.name}", expected, str(said)) from None
 
     def _stored_identity(self, mine: Identity) -> Identity:
-        """What the store is of: of this network, if it is new."""
+        """Return the identity that the store was made with; a new store takes `mine`."""
+        # All tables are there, or none: a store with some missing is damaged.
         there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
         if there and there != set(TABLES.tables):
             raise self._broken(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
+            # A store without an identity is new, unless it has counted something.
             stored = connection.execute(
                 select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
             ).scalar()
@@ -97,7 +104,7 @@ class Store:
         return {"layout of the store": "1"} | result
 
     def _damaged(self) -> dict[str, Damage]:
-        """Plants whose rows are damaged, by name."""
+        """Return the plants with damaged rows, by name."""
         results: dict[str, Damage] = {}
         with self._engine.connect() as connection:
             if self._engine.dialect.name == "sqlite":
@@ -115,12 +122,12 @@ class Store:
 
     @property
     def name(self) -> str:
-        """What to call it where others read: a file, or a URL without its password."""
+        """Return the store's name for messages: a file, or a URL without its password."""
         url = self._engine.url
         return url.database or "" if url.get_backend_name() == "sqlite" else url.render_as_string(hide_password=True)
 
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
-        """The plants of these names that are kept, and those of which only damage is left."""
+        """Load the stored plants of these names; of some only damage may be left."""
         names = list(names)
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             rows = _of(connection, list(PLANTS.c), names)
@@ -141,11 +148,7 @@ class Store:
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
     def begin_anew(self, names: Iterable[str]) -> None:
-        """Forget the plants of these names: each begins anew with its next message.
-
-        Raises:
-            ValueError: a name that no plant here has.
-        """
+        """Forget the plants of these names: each begins anew with its next message."""
         with self._saying("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
@@ -157,10 +160,12 @@ class Store:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Keep plants, of the versions they had before, and what is to be told; `published`: up to where it was.
+        """Commit plants, which must have the versions that they were read with, and outputs.
+
+        `published` is the number of the last output that was published, None if that has not changed.
 
         Raises:
-            ConflictError: a plant has another version.
+            ConflictError: another process has committed one of the plants.
         """
         with self._saying("a database that takes a commit"):
             return self._committed(plants, entries, malformed, published)
@@ -169,11 +174,13 @@ class Store:
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
         with self._engine.begin() as connection:
+            # The count locks the store for the other processes, which then see the new versions.
             newest = self._count(connection, NEWEST, len(entries))
             result = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
             if any(result.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
             outputs = [entry.numbered(newest - len(entries) + i) for i, entry in enumerate(entries, 1)]
+            # Plants with their next version, the batch in the journal, and the counts.
             if plants:
                 after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
                 self._put(connection, PLANTS, [_row(PLANTS, *row) for row in after])
@@ -188,7 +195,7 @@ class Store:
         return outputs
 
     def unpublished(self) -> list[Output]:
-        """What this process committed and may not have told."""
+        """Return outputs that this process committed and may not have published."""
         published = self.number(PUBLISHED.format(self.process))
         return [
             entry
@@ -197,10 +204,10 @@ class Store:
         ]
 
     def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
-        """What the journal keeps from the batch on that has number `after` + 1; of one process, or of all.
+        """Return the journal from the batch with number `after` + 1 on, of one process or of all.
 
         Raises:
-            ValueError: an entry that is damaged.
+            ValueError: a damaged entry.
         """
         expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
         result = list[Output]()
@@ -214,11 +221,7 @@ class Store:
         return result
 
     def number(self, name: str) -> int:
-        """A count that is kept.
-
-        Raises:
-            ValueError: one that is damaged.
-        """
+        """Return a stored count."""
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._counted(*row)
@@ -229,11 +232,7 @@ class Store:
         return value
 
     def begin_from(self, place: str, mine: Identity) -> None:
-        """Take the plants of another store, which stays as it is.
-
-        Raises:
-            ValueError: plants here already; the state of another network, version or precision there.
-        """
+        """Copy the plants of another store, which is not changed."""
         other = Store(place, mine)
         saying = self._saying(f"a database that takes the plants of {other.name}")
         with saying, self._engine.begin() as here, other._engine.connect() as there:
@@ -245,16 +244,16 @@ class Store:
         other.close()
 
     def count(self) -> int:
-        """How many plants are kept."""
+        """Return the number of stored plants."""
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             return int(connection.execute(select(func.count()).select_from(PLANTS)).scalar_one())
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database."""
         self._engine.dispose()
 
     def _count(self, connection: Connection, name: str, more: int) -> int:
-        """Add to a number, which locks it until the commit; what it is then."""
+        """Add to a stored count, which locks it until the commit; return the new value."""
         new = self._insert(NUMBERS).values(_row(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
@@ -272,7 +271,7 @@ class Store:
 
 
 def _of(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
-    """Columns of the plants of these names."""
+    """Select columns of the plants of these names."""
     results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
         results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
@@ -280,7 +279,7 @@ def _of(connection: Connection, columns: Sequence[Column[object]], names: list[s
 
 
 def _row(table: Table, *values: Any) -> dict[str, object]:
-    """A row with its checksum."""
+    """Add the checksum to a row."""
     columns = [column.name for column in table.c]
     return dict(zip(columns, (*values, checksum(*values)), strict=True))
 

@@ -1,4 +1,4 @@
-"""What a service asks of whatever keeps its state."""
+"""Interface between a service and the store of its state."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
@@ -7,9 +7,9 @@ from heliograph.serving.output import Kind, Output
 
 
 class StoredPlant(NamedTuple):
-    """A plant in the store; its version counts its commits, 0 before the first.
+    """A plant in the store; `version` counts its commits, 0 before the first.
 
-    `damage`: what is wrong with what the store has of it; then there is no body.
+    `damage` says what is wrong with the stored rows; there is no body then.
     """
 
     version: int
@@ -18,54 +18,56 @@ class StoredPlant(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """A row that is not what was written: whether its name is, and the checksum that stands there."""
+    """A row that is not as written: whether its name is, and the checksum that stands there."""
 
     named: bool
     checksum: object
 
 
 class Entry(NamedTuple):
-    """What is to be told once: its line of JSON lacks the number, which the commit gives."""
+    """An output to publish exactly once; its line of JSON lacks the number, which the commit assigns."""
 
     plant: str
     kind: Kind
     body: bytes
 
     def numbered(self, number: int) -> Output:
-        """The output with its number."""
+        """Return the output with its number."""
         return Output(number, self.plant, self.kind, b'{"id":%d,' % number + self.body[1:])
 
 
 class ConflictError(Exception):
-    """Another process has committed a plant since it was read: read it again, and use the messages again."""
+    """Conflict of commits: another process has committed the plant; read it and use the messages again."""
 
 
 class StoreProtocol(Protocol):
-    """What a service needs of a store."""
+    """Operations that a service needs of a store."""
 
     keeps: bool
 
     def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
-        """The plants of these names that are kept, and those of which only damage is left."""
+        """Load the stored plants of these names; of some only damage may be left."""
 
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Keep plants, of the versions they had before, and what is to be told; `published`: up to where it was.
+        """Commit plants, which must have the versions that they were read with, and outputs.
+
+        `published` is the number of the last output that was published, None if that has not changed.
 
         Raises:
-            ConflictError: a plant has another version.
+            ConflictError: another process has committed one of the plants.
         """
 
     def unpublished(self) -> list[Output]:
-        """What this process committed and may not have told."""
+        """Return outputs that this process committed and may not have published."""
 
     @property
     def name(self) -> str:
-        """What to call it, without a password."""
+        """Return the store's name for messages, without a password."""
 
     def count(self) -> int:
-        """How many plants are kept."""
+        """Return the number of stored plants."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release the resources of the store."""

@@ -1,4 +1,4 @@
-"""The tables of a store, and the checksums of their rows: a row is what was written, or it is damaged."""
+"""Tables of a store, and the checksums of their rows: a row is as written, or it is damaged."""
 
 from collections.abc import Sequence
 from zlib import crc32
@@ -17,22 +17,19 @@ IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=T
 
 
 def checksum(name: str | int, *values: str | int | bytes) -> int:
-    """CRC-32 of what a row is called, in the upper 31 of 63 bits, and of its name and other columns, in the lower 32.
-
-    So damage of the values leaves the name to be trusted.
-    """
+    """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32."""
     return (crc32(f"{name}".encode()) >> 1) << 32 | _sum(name, values)
 
 
 def is_whole(written: object, name: object, *values: object) -> bool:
-    """Whether a row is as it was written; anything may stand where it was damaged."""
+    """Return whether a row is as it was written; a damaged row may contain anything."""
     if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
         return False
     return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
 
 
 def is_named(written: object, name: object) -> bool:
-    """Whether a row's name is as it was written, whatever became of its values."""
+    """Return whether the name of a row is as it was written, whatever became of its values."""
     return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
 
 
