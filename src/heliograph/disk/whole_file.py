@@ -18,7 +18,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Yield temporary files next to several small ones, which they replace together; after an error nothing is changed."""
+    """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
         _clear(path)
