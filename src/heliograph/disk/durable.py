@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, also after the power went."""
+"""Files that appear whole or not at all, also after a power failure."""
 
 import os
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def sync(path: Path) -> None:
-    """Have what is written to a file or folder on the disk."""
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -16,13 +16,13 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Have a folder with all that is in it on the disk."""
+    """Flush a folder with all its contents to the disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def replace(partial: Path, path: Path) -> None:
-    """Put a file that is whole in the place of another, or of none."""
+    """Move a complete file to `path`, atomically, over an existing file if there is one."""
     sync(partial)
     os.replace(partial, path)
     sync(path.parent)
@@ -30,7 +30,7 @@ def replace(partial: Path, path: Path) -> None:
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Have errors of the system name the file, folder or stream that they are about: a full disk does not."""
+    """Add the path to errors of the system that lack one, such as that of a full disk."""
     try:
         yield
     except OSError as error:

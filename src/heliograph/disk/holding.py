@@ -1,4 +1,4 @@
-"""One process at a time: a file or folder held by a lock that the system takes back when its process ends, however."""
+"""Exclusive use of a file or folder by one process, through a lock that the system releases when the process ends."""
 
 import os
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ LOCK = ".lock"
 
 @contextmanager
 def held(path: Path) -> Iterator[bool]:
-    """Hold what is there at `path`, if nobody else does; says whether it is held."""
+    """Try to lock the file or folder at `path`; yields whether the lock was obtained."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except FileNotFoundError:  # its holder has just removed it
@@ -29,20 +29,23 @@ def held(path: Path) -> Iterator[bool]:
 
 @contextmanager
 def only_here(folder: Path) -> Iterator[bool]:
-    """Hold a folder by a file in it, which goes with the lock; a folder that was made for it and stayed empty goes too.
+    """Lock a folder by a lock file in it; yields whether the lock was obtained.
 
-    A process that is killed leaves the file, which then holds nothing.
+    The lock file is removed with the lock, and so are folders that were made for it and stayed empty. A killed process
+    leaves the file, which then locks nothing.
     """
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / LOCK
     try:
         while True:
+            # Lock the file that is opened.
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
             if not _lock(handle):
                 os.close(handle)
                 yield False
                 return
+            # The path must still name the locked file: another process may have removed it.
             with suppress(FileNotFoundError):
                 if os.path.sameopenfile(handle, other := os.open(path, os.O_RDONLY)):
                     os.close(other)

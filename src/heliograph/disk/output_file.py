@@ -1,4 +1,4 @@
-"""Whether a file can be written, told before the work starts."""
+"""Check that a file can be written before the work starts."""
 
 import tempfile
 from collections.abc import Sequence
@@ -10,7 +10,15 @@ FORMATS = (".csv", ".parquet")
 
 
 def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
-    """Raise what writing a file would, before the work starts."""
+    """Raise the error that writing the file would raise, before the work starts.
+
+    Args:
+        path: file to be written.
+        formats: extensions that are allowed.
+
+    Raises:
+        ValueError: another extension, a folder at `path`, a folder that is missing or cannot be written.
+    """
     path = Path(path)
     if format_of(path, formats) == ".parquet":
         import pyarrow.parquet  # noqa: F401
@@ -35,7 +43,11 @@ def check_output_folder(folder: str | Path) -> None:
 
 
 def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    """The extension, which says the format."""
+    """Return the extension of a file name in lower case, which determines the format.
+
+    Raises:
+        ValueError: an extension that is not among `formats`.
+    """
     kind = path.suffix.lower()
     if kind not in formats:
         raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))

@@ -24,25 +24,30 @@ def check_replaceable(target: Path, mark: str) -> None:
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of `target` at the end; after an error or interrupt all is as it was.
+    """Yield an empty folder that replaces `target` at the end; after an error or interrupt `target` is unchanged.
 
-    What a process left that was killed over the same folder is cleared first, and what it had put aside is put back.
+    Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
+    aside
+    are restored.
     """
     clear_left(target)
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    # Write to a temporary folder in the same file system.
     new, old = partial / "new", partial / "old"
     try:
         new.mkdir()
         with held(partial), naming(target):
             yield new
             sync_tree(new)
+        # Swap by two renames.
         if target.exists():
             target.rename(old)
         new.rename(target)
         sync(target.parent)
     except BaseException:
+        # Undo: restore earlier results, remove everything that was made.
         if old.exists() and not target.exists():
             old.rename(target)
         shutil.rmtree(partial)
@@ -54,7 +59,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
 
 
 def clear_left(target: Path) -> None:
-    """Remove the hidden folders that killed processes left beside `target`; none that a living one works in."""
+    """Remove the temporary folders next to `target` that killed processes left, none that a running process uses."""
     for left in target.parent.glob(f".{glob_escape(target.name)}-*") if target.parent.is_dir() else ():
         if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
             continue

@@ -11,14 +11,14 @@ from heliograph.disk.durable import naming, replace
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
+    """Yield a temporary file next to `path` that replaces it at the end; removed after an error or interrupt."""
     with whole_files([path]) as (partial,):
         yield partial
 
 
 @contextmanager
 def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Temporary files beside several small ones, which take their places together; after an error all is as it was."""
+    """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
         _clear(path)
@@ -26,12 +26,14 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     try:
         with naming(paths[0]):
             yield partials
+        # Replace one by one, with the earlier contents of all but the last.
         for partial, path in zip(partials, paths, strict=True):
             before = path.read_bytes() if path != paths[-1] and path.exists() else None
             with naming(path):
                 replace(partial, path)
             replaced.append((path, before))
     except BaseException:
+        # Undo: remove temporary files, restore those that were replaced.
         for partial in partials:
             partial.unlink(missing_ok=True)
         if len(replaced) < len(paths):
@@ -41,14 +43,14 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _clear(path: Path) -> None:
-    """Remove what processes left that do not live any more."""
+    """Remove temporary files of processes that no longer run."""
     for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
         if not _lives(left.name.split(".")[-2]):
             left.unlink(missing_ok=True)
 
 
 def _lives(process: str) -> bool:
-    """Whether a process of this number runs; what others left is theirs where that cannot be told."""
+    """Return whether a process of this number runs; True where that is unknown."""
     try:
         os.kill(int(process), 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""How often packets must arrive for the mean error of a filter that is told of losses to stay bounded."""
+"""Critical arrival probability: how often packets must arrive for the mean error of a filter to stay bounded."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,16 +30,23 @@ class CriticalArrival(NamedTuple):
     gain: Float[np.ndarray, "n m"]
 
 
-def critical_arrival(plant: AnyPlant, sensor: AnySensor, gain: ArrayLike | None = None) -> CriticalArrival:
-    """Critical probabilities that a packet of all outputs arrives, independently at each step, and the receiver knows.
+def critical_arrival(
+    plant: AnyPlant, sensor: AnySensor, gain: "Float[ArrayLike, 'n m'] | None" = None
+) -> CriticalArrival:
+    """Return critical probabilities that a packet of all outputs arrives, independently at each step.
 
-    lower = 1 - 1/rho(A)^2: while nothing arrives P grows by rho(A)^2 a step. upper: the smallest arrival at which some
-    K passes rho((1 - arrival) A x A + arrival (A - K C) x (A - K C)) < 1. With as many independent outputs as states
-    they meet. Known in the field, and not proved here: where the unstable eigenvalues have distinct moduli, `lower` is
-    the truth (You, Fu and Xie, 2011; Mo and Sinopoli, 2012).
+    The receiver knows of losses. lower = 1 - 1/rho(A)^2: while nothing arrives P grows by rho(A)^2 a step. upper: the
+    smallest arrival at which some K passes rho((1 - arrival) A x A + arrival (A - K C) x (A - K C)) < 1. With as many
+    independent outputs as states they meet. Known in the field, and not proved here: where the unstable eigenvalues
+    have
+    distinct moduli, `lower` is the truth (You, Fu and Xie, 2011; Mo and Sinopoli, 2012). Process noise must reach the
+    unstable modes for anything to diverge.
 
-    `gain` (n, m): a filter gain K that is kept whatever arrives, xhat+ = A xhat + K (z - C xhat); then both are the
-    arrival from which on its error is bounded. Process noise must reach the unstable modes for anything to diverge.
+    Args:
+        plant: linear plant, constant over time.
+        sensor: linear sensor, constant over time.
+        gain: constant filter gain K (n, m) of xhat+ = A xhat + K (z - C xhat); both probabilities are then the arrival
+            from which on its error is bounded. None: the best gains.
 
     Raises:
         ValueError: a plant or sensor that is not linear or varies, a sensor that misses an unstable mode, a gain that
@@ -53,6 +60,7 @@ def critical_arrival(plant: AnyPlant, sensor: AnySensor, gain: ArrayLike | None 
 
     def gain_at(arrival: float) -> Float[np.ndarray, "n m"] | None:
         """A certified gain, or None."""
+        # Independent losses as a chain of two modes with equal rows: arrived, lost.
         chain = np.array([[arrival, 1 - arrival]] * 2)
         system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
         gains = find_gains(system) if fixed is None else (fixed, lost.T)
@@ -61,10 +69,12 @@ def critical_arrival(plant: AnyPlant, sensor: AnySensor, gain: ArrayLike | None 
     radius = spectral_radius(a)
     if radius < BELOW_ONE and fixed is None:
         return CriticalArrival(0.0, 0.0, np.zeros((len(a), len(c))))
+    # Lower bound 1 - rho(A)^-2.
     lower = max(1 - radius**-2, 0.0)
     if gain_at(1.0) is None:
         what = "sensor" if fixed is None else "gain"
         raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
+    # Upper bound: bisection over certified gains.
     upper, result = _smallest(gain_at, lower)
     return CriticalArrival(lower if fixed is None else upper, upper, result)
 

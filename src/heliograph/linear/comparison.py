@@ -1,4 +1,4 @@
-"""Whether a filter of higher degree is worth it, told before any run."""
+"""Gain of polynomial filters over the linear one, from the model alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,10 +24,13 @@ SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
 @readable
 @dataclass(frozen=True)
 class GainOverLinear:
-    """What each degree would bring: error covariances by degree, exact before any data.
+    """Error covariances of filters by degree, exact before any data, and the skewness that higher degrees exploit.
 
-    skewness: the largest standardised joint third central moment of (x_k, z_k) over all steps.
-    after: the steps before it are left out of `gain`, as the start is.
+    Args:
+        states: names of the states.
+        covariance: error covariance over time (time, n, n) by degree.
+        skewness: the largest standardised joint third central moment of (x_k, z_k) over all steps.
+        after: first step that counts in `gain`, which leaves out the start.
     """
 
     states: tuple[str, ...]
@@ -36,13 +39,13 @@ class GainOverLinear:
     after: int
 
     def gain(self, degree: int) -> Float[np.ndarray, "n"]:
-        """Share of the linear filter's error variance that this degree removes, for each state: 1 - ratio of means."""
+        """Return the share of the linear filter's error variance that this degree removes, for each state."""
         mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
         return np.asarray(1 - mean[degree] / mean[1])
 
     @property
     def symmetric(self) -> bool:
-        """Whether all third moments vanish; then the quadratic filter is the linear one (a cubic one may still gain).
+        """True if all third moments vanish; then the quadratic filter is the linear one (a cubic one may still gain).
 
         Third moments of (x_k, z_k) at one time are enough: x_j given x_i is affine in x_i plus independent noise, so
         the third moments across times are made of them, and centred squares are uncorrelated with all x_k and z_k.
@@ -58,9 +61,15 @@ def gain_over_linear(
     degrees: Sequence[int] = (2, 3),
     after: int | None = None,
 ) -> GainOverLinear:
-    """How much filters of these degrees gain over the best linear one, from the model alone.
+    """Compute how much filters of these degrees gain over the best linear one, from the model alone.
 
-    `after`: first step that counts, a third of the horizon unless given.
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel.
+        horizon: number of steps, 100 unless given.
+        degrees: degrees to compare with 1, each at least 2; (2, 3) unless given.
+        after: first step that counts, a third of the horizon unless given.
 
     Raises:
         ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
@@ -89,6 +98,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     for k in range(square.horizon):
         s, spread = square.step(k), before.covariance[k + 1]
         cross = s.output @ spread
+        # Joint covariance and mean of the lifted (x, z).
         joint = np.block([[spread, cross.T], [cross, cross @ s.output.T + s.noise]])
         mean = np.concatenate([before.mean[k + 1], s.output @ before.mean[k + 1] + s.offset])
         linear = [x[(i,)] for i in range(states)] + [len(spread) + z[(i,)] for i in range(outputs)]
@@ -96,6 +106,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
         for places, start in ((x, 0), (z, len(spread))):
             for (a, b), place in ((key, p) for key, p in places.items() if len(key) == 2):
                 i, j = start + places[(a,)], start + places[(b,)]
+                # k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c).
                 third = joint[start + place, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
                 size = deviation[i] * deviation[j] * deviation[linear]
                 ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)

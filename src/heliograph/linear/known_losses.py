@@ -1,4 +1,4 @@
-"""A linear plant heard over links whose losses are told: gains, certificates of a bounded mean error, and its limits.
+"""Linear plants behind links whose losses the receiver knows: gains, certificates of a bounded mean error, its limits.
 
 P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next.
 """
@@ -23,10 +23,11 @@ Parts = Float[np.ndarray, "modes n n"]
 
 
 class KnownLossSystem(NamedTuple):
-    """x+ = A x + w, Cov(w) = Q; in mode i the receiver is told its kind s = told[i] and reads C_s x + v, Cov(v) = R_i.
+    """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i of which the receiver knows the kind s = known[i].
 
-    `chain[i, j]` = P(next mode j | now i), `law` the modes' law after long. Modes of one kind cannot be told apart, so
-    a gain belongs to a kind. A kind without rows is a loss.
+    It receives C_s x + v, Cov(v) = R_i. `chain[i, j]` = P(next mode j | now i), `law` is the modes' law in the long
+    run.
+    The receiver cannot distinguish modes of one kind, so a gain belongs to a kind. A kind without rows is a loss.
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -39,26 +40,26 @@ class KnownLossSystem(NamedTuple):
 
     @property
     def forgets(self) -> bool:
-        """Whether the modes are independent over time."""
+        """True if the modes are independent over time."""
         return bool(np.all(self.chain == self.chain[0]))
 
     def loops(self, gains: KindGains) -> Parts:
-        """F_i = A - K C of each mode."""
+        """Return F_i = A - K C of each mode."""
         return np.array([self.transition - gains[s] @ self.outputs[s] for s in self.known])
 
     def moved(self, gains: KindGains, parts: Parts, source: Parts) -> Parts:
-        """U_j+ = sum_i chain[i, j] (F_i U_i F_i' + source_i): Joseph's form, true of any gains."""
+        """Return U_j+ = sum_i chain[i, j] (F_i U_i F_i' + source_i): Joseph's form, true of any gains."""
         loops = self.loops(gains)
         return np.asarray(np.einsum("ij,iab->jab", self.chain, loops @ parts @ loops.swapaxes(1, 2) + source))
 
     def source(self, gains: KindGains) -> Parts:
-        """What noise adds to F_i U_i F_i': law_i (K R_i K' + Q)."""
+        """Return the noise that adds to F_i U_i F_i': law_i (K R_i K' + Q)."""
         modes = zip(self.law, self.known, self.noises, strict=True)
         return np.array([p * (gains[s] @ r @ gains[s].T + self.process) for p, s, r in modes])
 
 
 def long_run_law(initial: Float[np.ndarray, "modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
-    """The law of a chain's modes on average over a long time: that of one which waits half of the time."""
+    """Return the average law of a chain's modes over a long time: that of the lazy chain (Pi + I) / 2."""
     lazy = (chain + np.eye(len(chain))) / 2
     for _ in range(60):
         lazy = lazy @ lazy
@@ -122,10 +123,10 @@ def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
-    """Gains that make the steady bound on E P small: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
+    """Find gains that make the steady bound on E P small: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
 
     The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
-    settle; what is left is done by policy iteration. Where that is not certified, gains A C+ are tried, with which an
+    converge; policy iteration improves them. Where the result is not certified, gains A C+ are tried, with which an
     output that shows all of x leaves no old error.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
@@ -133,6 +134,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
     size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
     parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    # Value iteration, renormalised where covariances grow.
     noise, gains = 1.0, _improved(system, parts, 1.0)
     for _ in range(ITERATIONS):
         parts = system.moved(gains, parts, noise * system.source(gains))
@@ -142,6 +144,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
         before, gains = gains, _improved(system, parts, noise)
         if _change(before, gains) < CONVERGED:
             break
+    # Policy iteration, and the certificate rho(operator) < 1.
     gains = _polished(system, gains)
     if spectral_radius(operator(system, gains)) < BELOW_ONE:
         return gains

@@ -40,16 +40,21 @@ class Route(NamedTuple):
 
 
 def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int) -> LinearSystem:
-    """The system of Y = monomials of x up to `degree`, measured by Z = monomials of z up to `degree`.
+    """Return the system of Y = monomials of x up to `degree`, measured by Z = monomials of z up to `degree`.
 
     E[Y+ | Y] = A Y + a and E[Z | Y+] = C Y+ + c are exact, with A and C the moments of the plant and of the route,
     Cov(w) = E[Y+ Y+'] - M E[Y Y'] M', Cov(v) = E[Z Z'] - K E[Y+ Y+'] K' (M, K with the constant). Both noises have
     mean zero given the state's whole past, so the best linear filter of this system is the best filter of x that is
-    a polynomial of this degree in each z_k. Degree 1 is the best linear filter, 2 the quadratic one.
+    a polynomial of this degree in each z_k. Every monomial appears once (the half-vectorised square); x is read off as
+    the monomials of degree 1.
 
-    Behind links that remember the monomials are kept for each of their modes (`lifted_modes`).
-
-    x is read off as the monomials of degree 1. Every monomial appears once (the half-vectorised square).
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel; behind links with memory the monomials are states for each of their modes
+            (`lifted_modes`).
+        degree: 1 gives the best linear filter, 2 the quadratic one.
+        horizon: number of steps.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a plant with inputs or with noise that depends on them, parts
@@ -61,6 +66,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
     routes, moments = model_routes(plant, sensor, channel, 2 * degree, horizon), initial_moments(start, 2 * degree)
+    # Memory: monomials times the indicator of each joint mode.
     if first(channel).remembers:
         projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
         distinct = {id(r.measurement): r.measurement for r in routes}
@@ -68,6 +74,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         items = [modes[id(r.measurement)] for r in routes]
         refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
         return lifted_modes([r.plant for r in routes], items, degree, moments, projection)
+    # Start of the lifted state: E Y_0 and Cov Y_0.
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
@@ -79,9 +86,9 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 def _lifted_steps(
     routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """The system's steps and the rounding of both noises; `varies`: whether the plant does, and what measures it.
+    """Return the system's steps and the rounding of both noises; `varies`: whether the plant does, and what measures it.
 
-    Where nothing varies and the moments of the state have come to stay, all later steps are as the last, to rounding.
+    Where nothing varies and the moments of the state are steady, all later steps equal the last, to rounding.
     """
     parts, lost = [], []
     steady = SteadyState(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
@@ -94,6 +101,7 @@ def _lifted_steps(
         if last is None or not _same(route.measurement, last.measurement):
             listen = Lifted(route.measurement, degree, varies[1])
         last = route
+        # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
         process, process_lost = move.conditional_spread(moments)
         moments = move.push(moments)
         check_moments(moments, k, 2 * degree)

@@ -29,7 +29,7 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 
 def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule) -> LinearSystem:
-    """The square of (x, q, z), with q the estimate of a linear filter: q+ = F q + K z+ + c.
+    """Return the square of (x, q, z), with q the estimate of a linear filter: q+ = F q + K z+ + c.
 
     Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
     `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
@@ -44,6 +44,7 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
         raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
     total = 2 * n + m
     refuse_lift(2, total, m + n, horizon)
+    # (x_0, q_0, 0) is an affine function of x_0.
     beginning = _homogeneous(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
     moments = push_known(beginning, 4, initial_moments(start, 4))
     before = second_moments(moments, total + 1, 2)
@@ -52,9 +53,11 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
         move, listen = stored.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
         wide = stored.widen(route.measurement, n)
+        # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
         moments = push_known(listen, 4, wide[1] @ push(move, 4, moments))
         after = second_moments(moments, total + 1, 2)
+        # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
         process = after - transition @ before @ transition.T
         nothing = np.zeros(len(received)), np.zeros((len(received), len(received)))
         parts.append((*affine(transition), process[:-1, :-1], received, *nothing))
@@ -77,7 +80,7 @@ def _listen(g: Gains) -> np.ndarray:
 
 
 class _Recorded:
-    """What is computed anew only where the model changes: the noise's moments, and those of the route to z."""
+    """Cache of the noise's moments and those of the route to z, recomputed only where the model changes."""
 
     def __init__(self) -> None:
         self.noise: AbstractNoise | None = None

@@ -1,4 +1,4 @@
-"""A state that moves and is heard through maps that remember, both by the same modes, as one linear system."""
+"""Linear system of a state whose motion and measurement are maps with the same modes."""
 
 import numpy as np
 
@@ -21,20 +21,26 @@ Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  
 def modal_system(
     move: Channel,
     measure: Channel,
-    initial_mean: ArrayLike,
-    initial_covariance: ArrayLike,
+    initial_mean: "Float[ArrayLike, ' n']",
+    initial_covariance: "Float[ArrayLike, 'n n']",
     horizon: int,
-    projection: ArrayLike | None = None,
+    projection: "Float[ArrayLike, 'q n'] | None" = None,
 ) -> LinearSystem:
-    """The system of y 1{mode} for a state y+ = `move`(y), heard as z = `measure`(y+), both random affine maps.
+    """Return the system of y 1{mode} for a state y+ = `move`(y), measured as z = `measure`(y+), both random affine maps.
 
-    A plant that depends on a mode is a `move` with modes; a relay that filters what it hears in a shadow is a `move` of
-    (x, its estimate), and the receiver in the same shadow a `measure` that holds the same chain. With H_j the move in
+    A plant that depends on a mode is a `move` with modes; a relay that filters behind a shared fading is a `move` of
+    (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. With H_j the move in
     mode j, F[j, i] = Pi[i, j] E H_j and Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl
     sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}]. The two maps of a step are independent given its modes.
-    `projection` reads what is to be known off y, all of it unless given. `LinearSystemFilter` filters it, exactly.
+    `LinearSystemFilter` filters the result, exactly.
 
-    Shapes: initial_mean (n,), initial_covariance (n, n), want (q, n).
+    Args:
+        move: motion of y, from n to n numbers; its memories are chains.
+        measure: measurement of y.
+        initial_mean: mean of y before the first step (n,).
+        initial_covariance: its covariance (n, n).
+        horizon: number of steps.
+        projection: matrix W (q, n) of the estimated W y; all of y unless given.
 
     Raises:
         ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
@@ -49,11 +55,13 @@ def modal_system(
             raise fail(name, f"{n}, the move's inputs", size)
     if not all(isinstance(m, MarkovChain) for m in memories(move).values()):
         raise fail("move", "chains as its memories", "a gain that drifts")
+    # Homogeneous coordinates y~ = (y, 1).
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
     spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
     read = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
     pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
     steps = [joint_modes(Stack(pair)) for pair in pairs]
+    # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start.
     law, rows = np.asarray(steps[0].initial), np.eye(len(steps[0].initial))
     moments = law[:, None, None] * (np.outer(mean, mean) + spread)
     start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
@@ -61,6 +69,7 @@ def modal_system(
     for step in steps:
         maps = [m.maps for m in step.maps if isinstance(m, Stack)]
         moved, received = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+        # F, Cov(w) and E_i of one step; Cov(v) = sum_j Spread_j(E_j).
         transition, process, moments = _moved(moved, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
         output = np.concatenate(list(received[0]), axis=1)

@@ -19,10 +19,10 @@ def check_moments(moments: Moments, k: int, order: int) -> None:
 
 
 class SteadyState:
-    """Whether moments of x up to `order` stay, to rounding, where x+ = A x + noise has one law for all time.
+    """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
 
     What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)
-    times as much. They stay once that is below the rounding of each moment's own scale, E[x_i^2]^(1/2) for each x_i.
+    times as much. Moments are steady once that is below the rounding of their own scale, E[x_i^2]^(1/2) for each x_i.
     """
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
@@ -34,7 +34,7 @@ class SteadyState:
         self._last: Moments | None = None
 
     def stays(self, moments: Moments) -> bool:
-        """Whether these are as those of the call before."""
+        """Return whether the moments are those of the call before, to rounding."""
         before, self._last = self._last, moments
         if before is None or self._tolerance < 0:
             return False

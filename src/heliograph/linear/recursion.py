@@ -101,7 +101,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
 
 
 def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
-    """Whether a covariance and its rounding stay, to STILL of each entry's own scale, from what SPAN steps changed.
+    """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
 
     A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
     and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
@@ -150,16 +150,19 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     yy, ss = system.covariance, np.zeros((len(state), len(state)))
     ys = np.zeros((len(mean), len(state)))
     result = []
+    # Joint moments of system state y, filter state s and measurement z.
     for k in range(system.horizon):
         s, now = system.step(k), Gains(*(field[k] for field in g))
         mean = s.transition @ mean + s.drift
         z = s.output @ mean + s.offset
         yy, ys = s.transition @ yy @ s.transition.T + s.process, s.transition @ ys
         zz, yz, sz = s.output @ yy @ s.output.T + s.noise, yy @ s.output.T, ys.T @ s.output.T
+        # E(x - xhat) and Cov(x - xhat) = row Cov(y, s, z) row'.
         bias = system.projection @ mean - now.output @ state - now.direct @ z - now.output_offset
         joint = np.block([[yy, ys, yz], [ys.T, ss, sz], [yz.T, sz.T, zz]])
         row = np.concatenate([system.projection, -now.output, -now.direct], axis=1)
         result.append(row @ joint @ row.T + np.outer(bias, bias))
+        # s+ = F s + K z + c.
         state = now.transition @ state + now.gain @ z + now.offset
         cross = now.transition @ sz @ now.gain.T
         ss = now.transition @ ss @ now.transition.T + cross + cross.T + now.gain @ zz @ now.gain.T

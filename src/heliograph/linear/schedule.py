@@ -1,4 +1,4 @@
-"""A schedule of gains: a filter computed before any data, as arrays over time with the covariance it claims."""
+"""Schedules of gains: a filter computed before any data, as arrays over time with the covariance it claims."""
 
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -15,11 +15,14 @@ from heliograph.numerics.types import ArrayLike, Float
 
 @readable
 class Gains(NamedTuple):
-    """s+ = F s + K z + c and xhat = L s + J z + d, s the state before the step; one row per step (one step: no axis).
+    """Gains of a linear filter, s+ = F s + K z + c and xhat = L s + J z + d with s the state before the step.
 
-    transition F, gain K, offset c, output L, direct J, output_offset d. `expected` G and `expected_offset` g say what z
-    the filter expects, G s + g: it stands in for what did not arrive. `covariance` is that of x - xhat; `predicted` of
-    x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. NaN in the last two where nobody knows.
+    One row per step (one step: no axis). transition F, gain K, offset c, output L, direct J, output_offset d. The
+    prediction of z is G s + g with `expected` G and `expected_offset` g: it replaces what did not arrive. `covariance`
+    is
+    that of x - xhat; `predicted` of x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. The last two are
+    NaN
+    where unknown.
     """
 
     transition: Float[np.ndarray, "*time N N"]
@@ -40,7 +43,12 @@ PERHAPS = ("predicted", "innovation")  # fields that may be unknown
 
 @readable
 class Schedule(Module):
-    """A linear filter over time from the state `start`; its covariance is claimed for complete data.
+    """Linear filter over time with precomputed gains, and the covariance that it claims for complete data.
+
+    Args:
+        gains: gains and covariances of each step.
+        start: the filter's state before the first step (N,).
+        claim: what the covariance is: "exact", "upper", "nominal" or "none".
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite (the last two fields may be NaN), an unknown
@@ -51,7 +59,7 @@ class Schedule(Module):
     start: Float[np.ndarray, "N"]
     claim: Claim = eqx.field(static=True)
 
-    def __init__(self, gains: Gains, start: ArrayLike, claim: Claim):
+    def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
         time, n, m = np.shape(gains.gain)
@@ -87,7 +95,7 @@ def _known(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def load_schedule(path: str | Path) -> Schedule:
-    """Read what `Schedule.save` wrote.
+    """Read the schedule that `Schedule.save` wrote to the file `path`.
 
     Raises:
         ValueError: a file that holds no schedule.

@@ -13,9 +13,9 @@ from heliograph.numerics.types import ArrayLike, Float
 
 @readable
 class Steps(NamedTuple):
-    """What happens at each step, every array with a leading time axis (one step has none).
+    """Steps of a linear system y+ = A y + a + w, z = C y+ + c + v, every array with a leading time axis (one step: none).
 
-    y+ = A y + a + w, z = C y+ + c + v: transition A, drift a, process Cov(w), output C, offset c, noise Cov(v).
+    transition A, drift a, process Cov(w), output C, offset c, noise Cov(v).
     """
 
     transition: Float[np.ndarray, "*time N N"]
@@ -28,14 +28,22 @@ class Steps(NamedTuple):
 
 @readable
 class LinearSystem(Module):
-    """y+ = A y + a + w, z = C y+ + c + v, and what is to be known, x = W y.
+    """Linear system y+ = A y + a + w, z = C y+ + c + v, of which x = W y is to be estimated.
 
     w and v have mean zero given all earlier y and are uncorrelated with each other. Random coefficients fit: take A and
     C as their means, and as Cov(w), Cov(v) what is left over, E[(H - EH) y y' (H - EH)'] plus noise. A measurement
     that shares the step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
 
-    mean, covariance: of y before the first step. projection: W. rounding, received_rounding, start_rounding: absolute
-    rounding errors of the diagonals of `process`, `noise` and `covariance`, where these came out of a subtraction.
+    Args:
+        steps: matrices of each step.
+        mean: mean of y before the first step (N,).
+        covariance_: its covariance (N, N).
+        projection: W (q, N).
+        rounding: absolute rounding error of the diagonal of `process` (time, N), where it came out of a subtraction;
+            zero
+            unless given, like the next two.
+        received_rounding: the same of `noise` (time, m).
+        start_rounding: the same of `covariance_` (N,).
 
     Raises:
         ValueError: shapes that do not fit, or a start that has no covariance.
@@ -52,12 +60,12 @@ class LinearSystem(Module):
     def __init__(
         self,
         steps: Steps,
-        mean: ArrayLike,
-        covariance_: ArrayLike,
-        projection: ArrayLike,
-        rounding: ArrayLike | None = None,
-        received_rounding: ArrayLike | None = None,
-        start_rounding: ArrayLike | None = None,
+        mean: "Float[ArrayLike, ' N']",
+        covariance_: "Float[ArrayLike, 'N N']",
+        projection: "Float[ArrayLike, 'q N']",
+        rounding: "Float[ArrayLike, 'time N'] | None" = None,
+        received_rounding: "Float[ArrayLike, 'time m'] | None" = None,
+        start_rounding: "Float[ArrayLike, ' N'] | None" = None,
     ):
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
@@ -112,7 +120,10 @@ class StateMoments(NamedTuple):
 
 
 def state_moments(system: LinearSystem) -> StateMoments:
-    """Moments of y before any data: X+ = A X A' + Cov(w). No best filter's error exceeds them, P_k <= X_k."""
+    """Propagate the moments of y of a `system` before any data: X+ = A X A' + Cov(w).
+
+    No best filter's error exceeds them, P_k <= X_k.
+    """
     instance("system", system, LinearSystem, "a LinearSystem")
     mean, spread = system.mean, system.covariance
     means, spreads = [mean], [spread]

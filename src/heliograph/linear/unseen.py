@@ -1,4 +1,4 @@
-"""What no filter can bound: modes of the plant that grow faster, while links fail to show them, than failures end."""
+"""Lower bounds of any filter's error: plant modes that grow, while links do not show them, faster than failures end."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ SETS_LIMIT = 256  # sets of modes that are tried for one eigenvalue
 
 
 class Unseen(NamedTuple):
-    """An eigenvalue's growth while the links stay where they do not show it: growth = |a|^2 rho(chain among these).
+    """Growth of an eigenvalue while the links stay in modes that do not show it: |a|^2 rho(chain among these).
 
     From 1 on, the mean error of every filter grows without end, if noise reaches the eigenvector.
     """
@@ -26,7 +26,7 @@ class Unseen(NamedTuple):
 
 
 def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
-    """Each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
+    """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
     results: list[tuple[complex, np.ndarray]] = []
     size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
     for value in np.linalg.eigvals(matrix):
@@ -40,7 +40,7 @@ def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndar
 def fastest_unseen(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
 ) -> Unseen:
-    """The largest growth over eigenvalues and sets of modes; `outputs` are the rows C_i (m, n) that each mode shows.
+    """Return the largest growth over eigenvalues and sets of modes; `outputs` are the rows C_i (m, n) of each mode.
 
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
     """
@@ -80,7 +80,7 @@ def _kernel(output: np.ndarray, space: np.ndarray) -> np.ndarray:
 
 
 def reached(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
-    """Whether a noise reaches every one of these directions within n steps (the controllable subspace)."""
+    """Return whether a noise reaches every one of these directions within n steps (the controllable subspace)."""
     basis, columns = np.zeros((len(matrix), 0)), noise
     for _ in range(len(matrix)):
         size = np.linalg.norm(columns, 2) if columns.size else 0.0

@@ -1,4 +1,4 @@
-"""What is observed and how: plants, sensors, channels, relays, over time; and what an estimate is."""
+"""Models: plants, sensors, channels and relays, constant or over time; and what an estimate is."""
 
 import lazy_loader
 

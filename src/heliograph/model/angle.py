@@ -1,4 +1,4 @@
-"""Where plant, sensor and channel agree on what is an angle."""
+"""Agreement of plant, sensor and channel on which numbers are angles."""
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
@@ -10,7 +10,7 @@ from heliograph.random_affine.carried import carried
 
 
 def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
-    """Which components of what arrives are angles; parts that fit each other are given.
+    """Return the indices of received components that are angles; plant, sensor and channel must fit each other.
 
     Raises:
         ValueError: a channel that leaves no angle of one, or a sensor whose outputs a full turn of a state changes.

@@ -20,18 +20,22 @@ from heliograph.random_affine.base import AbstractRandomAffine, as_maps
 
 
 @overload
-def centred(channel: AbstractRandomAffine, reference: ArrayLike) -> AbstractRandomAffine: ...
+def centred(channel: AbstractRandomAffine, reference: "Float[ArrayLike, '*m']") -> AbstractRandomAffine: ...
 @overload
-def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel: ...
+def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") -> Channel: ...
 
 
-def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel:
-    """The channel that sends y - r: z = G (y - r) + n + E[G] r, where the receiver knows r and adds E[G] r back.
+def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") -> Channel:
+    """Return the channel that sends y - r: z = G (y - r) + n + E[G] r, where the receiver knows r and adds E[G] r.
 
-    E[z | y] is that of the channel itself; power and the gain's noise see E (y - r)^2 in place of E y^2. `reference` r
-    is a constant (m,), a number where one is sent, or an `OverTime` of one for each step: a trajectory, or
-    `expected_signal`, the best of all that is known before. Any sensor, linear or not, and any filter take the result,
-    and so does a relay between two hops.
+    E[z | y] is that of the channel itself; power and the gain's noise see E (y - r)^2 in place of E y^2. Any sensor,
+    linear
+    or not, and any filter take the result, and so does a relay between two hops.
+
+    Args:
+        channel: a channel without delays and erasures, constant or an `OverTime`.
+        reference: r (m,), a number where one is sent, or an `OverTime` of one for each step: a trajectory, or
+            `expected_signal`, the best of all that is known before.
 
     Raises:
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
@@ -57,12 +61,20 @@ def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> 
 
 
 def expected_signal(
-    plant: AnyPlant, sensor: AnySensor, horizon: int, inputs: ArrayLike | None = None
+    plant: AnyPlant, sensor: AnySensor, horizon: int, inputs: "Float[ArrayLike, 'horizon inputs'] | None" = None
 ) -> Float[np.ndarray, "horizon outputs"]:
-    """E[y_k] at each step of a linear plant and sensor; h along the path without noise of a nonlinear one.
+    """Return E[y_k] at each step of a linear plant and sensor; h along the noise-free path of a nonlinear one.
 
     Of all references that do not depend on data, E[y_k] leaves the least to send: E (y - r)^2 = Var y + (E y - r)^2.
-    `inputs` (horizon, inputs) as they are planned.
+
+    Args:
+        plant: the plant.
+        sensor: its sensor.
+        horizon: number of steps.
+        inputs: planned inputs (horizon, inputs); None for a plant without inputs.
+
+    Returns:
+        E[y_k], (horizon, outputs).
 
     Raises:
         ValueError: a horizon beyond what varies over time, a sensor that does not fit, inputs of another shape.

@@ -79,8 +79,15 @@ def perfect(dimension: int = 1) -> GainAndNoise:
     return known(np.eye(check_count("dimension", dimension)))
 
 
-def silent(outputs: int = 1, inputs: int | None = None, noise: AbstractNoise | ArrayLike = 0.0) -> GainAndNoise:
-    """A channel through which nothing comes but noise: z = n.
+def silent(
+    outputs: int = 1, inputs: int | None = None, noise: "AbstractNoise | Float[ArrayLike, '*outputs']" = 0.0
+) -> GainAndNoise:
+    """Return a channel that delivers noise alone: z = n.
+
+    Args:
+        outputs: length of z, 1 unless given.
+        inputs: length of y; as many as outputs unless given.
+        noise: law of n, its covariance (outputs, outputs), or a variance that all components have, 0 unless given.
 
     Raises:
         ValueError: a noise that is no covariance or of another dimension.
@@ -91,23 +98,29 @@ def silent(outputs: int = 1, inputs: int | None = None, noise: AbstractNoise | A
 
 
 def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """A chain of hops through relays that amplify what they hear, noise included: z = H_N ... H_2 H_1 y.
+    """Chain `hops` through relays that amplify what they receive, noise included: z = H_N ... H_2 H_1 y.
 
     Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
-    be late, and the delays add up; a relay that is late by chance may forward one value twice, with one noise m.
+    be late, and the delays add up; a relay with a random delay may forward one value twice, with one noise m.
 
     Raises:
-        ValueError: no hop, hops whose dimensions do not fit, delays told on the way, memory before a delay.
+        ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
     return in_series(hops)
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
-    """A link that hears at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k; before the first step, zeros.
+    """Return a link that receives at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k.
 
-    `delay` is a number of steps, a `Discrete` law from which one is drawn at each step, or a `MarkovChain` whose mode
-    it is: then one y may be heard twice, or never. `timestamped`: the receiver knows d, as the last number of z.
+    Before the first step zeros were sent.
+
+    Args:
+        link: the link without delay.
+        delay: d in steps; a `Discrete` law from which d is drawn at each step; or a `MarkovChain` whose mode is d.
+            Drawn
+            delays may deliver one y twice, or never.
+        timestamped: True if the receiver knows d, as the last number of z; False unless given.
 
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
@@ -116,7 +129,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
-    """A channel whose packet is lost with probability 1 - arrival; the receiver then reads zero and is not told.
+    """Return a channel whose packet is lost with probability 1 - arrival; the receiver reads z = 0 and does not know.
 
     Where the receiver knows of the loss, it is an `erasure`.
 

@@ -56,7 +56,7 @@ class Stamped(AbstractSensor):
 
 
 class Clocked(AbstractPlant):
-    """A plant that is not linear, and clocks beside it."""
+    """Nonlinear plant with offset and drift of clocks as further states."""
 
     base: AbstractPlant
     move: Matrix
@@ -77,16 +77,21 @@ def with_clocks(
     plant: AbstractPlant,
     sensors: Mapping[str, AbstractSensor],
     clocks: Mapping[str, Clock],
-    motion: Motion | ArrayLike,
-    dt: ArrayLike,
+    motion: "Motion | Float[ArrayLike, 'n n']",
+    dt: "Float[ArrayLike, '']",
 ) -> tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]:
-    """The plant with an offset and a drift for each clock as states, and the sensors of all nodes as sensors of it.
+    """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
-    A value is taken as one of the time with which it is stamped. A node of `clocks` stamps by its own clock, s = t + o:
-    it then measures the plant o before that time, h = y - o dy/dt. `motion` is dx/dt, a function of x or its matrix;
-    `dt` the time of a step, over which o grows by dt drift. Named after their nodes: "NODE_offset", "NODE_drift".
+    A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
+    sensor
+    then measures the plant o before that time, h = y - o dy/dt. The new states are "NODE_offset" and "NODE_drift".
 
-    Shapes: motion (n, n).
+    Args:
+        plant: the plant, constant over time.
+        sensors: sensor of each node, by its name.
+        clocks: clock of each node that has one of its own.
+        motion: dx/dt, a function of x or its matrix (n, n).
+        dt: time of a step, over which o grows by dt drift.
 
     Raises:
         ValueError: a clock whose node has no sensor, negative deviations, noise that depends on inputs, wrong shapes.
@@ -108,17 +113,20 @@ def with_clocks(
 def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Clocked:
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
+    # Independent initial offset and drift of each clock; drift is a random walk.
     spread, wander = [], []
     for name, clock in clocks.items():
         for part in Clock._fields:
             scalar(f"{part} of the clock of {name!r}", getattr(clock, part), 0.0)
         spread += [clock.offset**2, clock.drift**2]
         wander += [0.0, clock.wander]
+    # o+ = o + dt d, d+ = d.
     move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
     center = library(plant.initial_mean).concatenate([plant.initial_mean - law.mean, np.zeros(len(move))])
     states = (*plant.states, *(f"{name}_{part}" for name in clocks for part in ("offset", "drift")))
+    # Block-diagonal dynamics of (x, clocks).
     if isinstance(plant, LinearPlant):
         xp, n = library(plant.matrix, plant.input_matrix), len(plant.states)
         others = np.zeros((n, len(move)))
@@ -162,7 +170,7 @@ class JointSensor(AbstractSensor):
 
 
 def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> JointSensor:
-    """What a centre hears of nodes, in their order: with `parallel` of their channels, one sensor for a filter there.
+    """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
 
     Raises:
         ValueError: no sensors, or one that varies.

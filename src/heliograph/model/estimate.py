@@ -39,14 +39,18 @@ class Estimate(Module):
 
 @readable
 class Innovation(Module):
-    """What a measurement says that the filter did not expect, and how likely the filter finds it.
+    """Innovation of a measurement: z - E[z | earlier data], its covariance and its log-likelihood.
 
-    value: z - E[z | what came before]; covariance: what the filter believes of it. Both are NaN in the components that
-    did not arrive. log_likelihood: log p(components that arrived | what came before) as the filter sees it, 0 when
-    nothing arrived; a Gaussian one, log N(value; 0, covariance), unless the filter says otherwise. A filter that claims
-    no covariance has none: then all but the value is NaN.
+    Components that did not arrive are NaN in value and covariance. A filter that claims no covariance has NaN in all
+    but
+    the value.
 
-    Shapes: value (..., m), covariance (..., m, m), log_likelihood (...).
+    Args:
+        value: z minus its prediction (..., m).
+        covariance: covariance of the innovation as the filter computes it (..., m, m).
+        log_likelihood: log p(components that arrived | earlier data) as the filter sees it (...), 0 when nothing
+            arrived;
+            log N(value; 0, covariance) unless the filter says otherwise.
     """
 
     value: Float[Array, "... m"]

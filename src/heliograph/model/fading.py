@@ -1,4 +1,4 @@
-"""Links that remember: fading in bursts, loss in bursts, gains that drift, and shadows that several links share."""
+"""Links with memory: fading in bursts, loss in bursts, gains that drift, and fading that several links share."""
 
 from collections.abc import Sequence
 from typing import cast
@@ -89,18 +89,23 @@ def autoregressive_fading(
 
 def with_flag(
     channel: AbstractRandomAffine,
-    probabilities: ArrayLike | None = None,
+    probabilities: "Float[ArrayLike, 'modes flags'] | None" = None,
     chain: MarkovChain | None = None,
     late: bool = False,
 ) -> Stack:
-    """The channel with a flag beside it, (z, flag): the number 0, 1, ... of a class that tells of a chain's mode.
+    """Return the channel with side information on the mode of a chain: (z, flag), a flag being a class 0, 1, ...
 
-    `probabilities` are P(flag | mode): a received strength, a modem's quality class; `chain` is the one that it tells
-    of, that of the channel if it holds one. Without both the states of all memories are told after z: the number of a
-    mode, the value of what drifts. `late`: each step hears the flag of the step before, and none at the first. The flag
-    is told, never lost with z.
+    The flag is never lost with z.
 
-    Shapes: probabilities (modes, flags).
+    Args:
+        channel: the channel.
+        probabilities: P(flag | mode), shape (modes, flags), as of a received strength or a modem's quality class.
+            Without
+            it, and without `chain`, the states of all memories are received after z: the number of a mode, the value of
+                a
+            drift.
+        chain: the chain on which the flag depends; that of the channel unless given.
+        late: True if each step receives the flag of the step before, and none at the first; False unless given.
 
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
@@ -139,12 +144,12 @@ def without_memory(channel: Channel) -> Channel:
 
 
 def memory_matters(channel: Channel) -> bool:
-    """Whether mean gains are correlated over time, so that a linear filter that assumes no memory claims too much.
+    """Return whether mean gains are correlated over time, so that a linear filter without memory claims too much.
 
-    Memory in the variance of noise alone does not matter to it. A chain that is known only roughly always may.
+    Memory in the variance of noise alone does not matter to it. An uncertain chain always may.
 
     Raises:
-        ValueError: a channel that remembers in a way of its own.
+        ValueError: a channel with a memory of another kind.
     """
     if not as_maps("channel", [first(channel)])[0].remembers:
         return False
@@ -155,5 +160,5 @@ def memory_matters(channel: Channel) -> bool:
 
 
 def uncertain_chain(channel: Channel) -> bool:
-    """Whether a chain in the channel is known only within a radius."""
+    """Return whether a chain in the channel is known only within a radius."""
     return any(np.any(m.radius > 0) for m in memories(channel).values() if isinstance(m, MarkovChain))

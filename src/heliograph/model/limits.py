@@ -1,4 +1,4 @@
-"""What no honest sensor says: numbers outside its range, and the codes by which it says that it failed."""
+"""Limits of a sensor's range, and codes by which a sensor reports that it failed."""
 
 from collections.abc import Sequence
 
@@ -17,9 +17,13 @@ def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits 
 
 
 class Limits(Module):
-    """Which received numbers count as not arrived: those below `low` or above `high`, and those equal to a code.
+    """Received numbers that count as missing: those below `low` or above `high`, and those equal to a code.
 
-    Shapes: low, high (m,), -inf and inf where there is no limit; invalid (codes,).
+    Args:
+        received: length m of a measurement.
+        limits: lowest and highest valid number of each component; None for no limits. Stored as low and high (m,), with
+            -inf and inf where there is none.
+        invalid: codes (codes,) that are no measurements.
     """
 
     low: Float[np.ndarray, " m"]
@@ -35,12 +39,12 @@ class Limits(Module):
         self.invalid = np.atleast_1d(codes)
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
-        """Which numbers do not count; NaN is none of them."""
+        """Return True for each number that counts as missing; NaN is not one of them."""
         codes = (z[..., None] == self.invalid).any(axis=-1) if len(self.invalid) else False
         return np.asarray((z < self.low) | (z > self.high) | codes)
 
     def why(self, z: Float[np.ndarray, " m"], names: Sequence[str]) -> str:
-        """What of a measurement does not count, in words; "" where all does."""
+        """Describe in words the components of a measurement that count as missing; "" if there are none."""
         said = []
         for i in np.flatnonzero(self.outside(z)).tolist():
             code = np.any(z[i] == self.invalid)

@@ -64,7 +64,7 @@ def stack(items: Sequence[T]) -> T:
 
 
 def structure(item: object) -> Hashable:
-    """What two model objects share that differ in nothing but the values of their arrays."""
+    """Return a key that is equal for model objects which differ in nothing but the values of their arrays."""
     return _structure(*jax.tree.flatten(item))
 
 
@@ -73,7 +73,7 @@ def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
 
 
 def alike(a: object, b: object) -> bool:
-    """Whether two model objects differ in nothing but the values of their arrays."""
+    """Return whether two model objects differ in nothing but the values of their arrays."""
     return structure(a) == structure(b)
 
 

@@ -1,4 +1,4 @@
-"""A linear plant with what its sensor sent before as states: what a filter needs behind a link that hears late."""
+"""Linear plants with past sensor outputs as states, for filters behind a delayed link."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent,
 
 
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
-    """Plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent at once: nothing is late.
+    """Return plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent without delay.
 
-    y+ = C (A x + B u + w) + v is a state with its noise, so that one y heard twice is known to be one. Past states x
+    y+ = C (A x + B u + w) + v is a state with its noise, so that one y received twice is known to be one. Past states x
     instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
     The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
 
@@ -38,18 +38,21 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
 
 
 def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
-    """x+ = A x + B u + w, y+ = C x+ + v, and the line moves on by one."""
+    """Return x+ = A x + B u + w, y+ = C x+ + v as one plant whose line of past outputs is shifted by one."""
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")
     c = sensor.matrix
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
     length = past * m
+    # (w, v) enters x+ and y+ = C w + v.
     enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
+    # y_k, ..., y_{k-D+1} move on by one place.
     shift = np.eye(length, length + m)
     moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
     rest = np.concatenate([np.zeros((n + m, length + m)), shift])
     driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
+    # Nothing was sent before the start.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     names = sensor.outputs
     line = [f"{name}_{d}_ago" if d else f"{name}_sent" for d in range(past + 1) for name in names]

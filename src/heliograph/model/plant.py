@@ -50,7 +50,7 @@ class AbstractPlant(Module):
 
     @property
     def angles(self) -> Angles:
-        """Which states are angles."""
+        """Indices of the states that are angles."""
         return tuple(self.states.index(name) for name in self.circular)
 
     def difference(self, x: A, other: A) -> A:
@@ -191,13 +191,15 @@ class LinearPlant(AbstractPlant):
         return jnp.asarray(self.matrix) @ x + jnp.asarray(self.input_matrix) @ u
 
 
-def with_bias(plant: LinearPlant, coupling: ArrayLike, bias: LinearPlant) -> LinearPlant:
-    """The plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
+def with_bias(plant: LinearPlant, coupling: "Float[ArrayLike, 'n bias']", bias: LinearPlant) -> LinearPlant:
+    """Return the plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
 
-    The bias is a plant of its own, independent of the first; every filter of the result estimates both. A name that
-    the plant has too gets the prefix "bias_".
+    Every filter of the result estimates both. A name that the plant has too gets the prefix "bias_".
 
-    Shapes: coupling E (n, bias states).
+    Args:
+        plant: the plant of x (n states).
+        coupling: E (n, bias states).
+        bias: the plant of b, without inputs, independent of the first.
 
     Raises:
         ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
@@ -209,12 +211,14 @@ def with_bias(plant: LinearPlant, coupling: ArrayLike, bias: LinearPlant) -> Lin
     coupling = array("coupling of the bias", coupling, (n, extra))
     if bias.inputs:
         raise fail("bias", "a plant without inputs", list(bias.inputs))
+    # (w, xi) and the two initial states are independent.
     noises = [p.noise for p in (plant, bias) if isinstance(p.noise, AbstractNoise)]
     if len(noises) < 2:
         raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
     deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
     centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
     xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
+    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; 0] u + [w; xi].
     renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
     return LinearPlant(
         xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),

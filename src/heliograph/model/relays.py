@@ -1,4 +1,4 @@
-"""A plant observed by a sensor, relays that filter and forward, and a receiver: who hears whom, slot by slot."""
+"""Relay networks: a plant observed by a sensor, relays that filter and forward, and a receiver, slot by slot."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -24,18 +24,25 @@ Slot = Mapping[str, Links]  # by listener
 
 @readable
 class RelayNetwork(Module):
-    """Relays with memory between a sensor and a receiver.
+    """Network of relays with memory between a sensor and a receiver.
 
     At step k the sensor sends y_k = C_k x_k + v_k and relay r sends C_k s_r, with s_r its estimate at k - 1: what it
-    hears at k, it can only forward later. Slot k (used in turn, from the first) says who listens to whom:
-    `slots[k][listener][sender]` is the link, a random affine map; a listener hears the sum of its links. Senders are
-    "sensor" and the relays, listeners the relays and "receiver". A relay that listens and is heard in one slot is full
-    duplex; its link to itself is self-interference.
+    receives at k, it can only forward later. A listener receives the sum of its links. A relay that listens and
+    transmits
+    in one slot is full duplex; its link to itself is self-interference. Links are independent of each other and over
+    time;
+    a link that is an OverTime is read at the step, not at the slot.
 
-    Links are independent of each other and over time. A link that is an OverTime is read at the step, not at the slot.
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        relays: names of the relays.
+        slots: one dictionary for each slot of the schedule, used in turn from the first: slots[k][listener][sender] is
+            the
+            link, a random affine map. Senders are "sensor" and the relays, listeners the relays and "receiver".
 
     Raises:
-        ValueError: no slots; a schedule in which nobody transmits to the receiver, or a relay that hears nobody but
+        ValueError: no slots; a schedule in which nobody transmits to the receiver, or a relay that receives nothing but
             itself; unknown names; links that do not fit; a plant or sensor that is not linear, a plant with inputs.
     """
 
@@ -68,7 +75,7 @@ class RelayNetwork(Module):
 
     @property
     def received(self) -> tuple[int, ...]:
-        """Length of what each filter hears, in the order of `filters`."""
+        """Length of what each filter receives, in the order of `filters`."""
         return tuple(
             next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
             for name in self.filters
@@ -81,7 +88,7 @@ class RelayNetwork(Module):
         return names
 
     def always_receives(self, name: str) -> bool:
-        """Whether some hop leads to this listener in every slot, and none of them erases."""
+        """Return whether some hop leads to this listener in every slot, and none of them erases."""
         observed = [slot.get(name, {}) for slot in self.slots]
         return all(observed) and not any(first(hop).erases for hops in observed for hop in hops.values())
 
@@ -102,6 +109,7 @@ class RelayNetwork(Module):
             ValueError: a horizon beyond what varies over time; links with uncertain probabilities.
         """
         self.check_horizon(horizon)
+        # Moments of each slot, computed once where links do not vary over time.
         varies = steps_covered(self.slots) is not None
         period = horizon if varies else min(len(self.slots), horizon)
         tables = [_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
@@ -110,6 +118,7 @@ class RelayNetwork(Module):
         )
         transition = _tile(self.plant, horizon, lambda p: p.matrix, 2)
         drift = _tile(self.plant, horizon, lambda p: p.noise.mean, 1)
+        # E x+ = A E x + E w.
         means = [self.initial()[0]]
         for a, b in zip(transition[:-1], drift[:-1], strict=True):
             means.append(a @ means[-1] + b)
@@ -131,11 +140,13 @@ class RelayNetwork(Module):
 
 
 class Steps(Module):
-    """What the second moments of a relay network need, for each step (leading axis).
+    """Matrices of a relay network that its second moments need, for each step (leading axis).
 
-    R numbers are heard by the F filters together, T = (1 + relays) m are sent: y, then what each relay sends. With
-    sent made homogeneous by a 1, W = E (sent, 1)(sent, 1)', what is heard has mean gain sent + offset and conditional
-    covariance spread_ij : W (noise included), and `live` rows hear something at all. `state_mean` is E x before it.
+    The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
+    With
+    W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij : W
+    (noise
+    included). Rows with `live` = 1 have some link; `state_mean` is E x before the step.
 
     Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
     (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, live (time, R), spread
@@ -158,7 +169,7 @@ class Steps(Module):
 
     @property
     def owner(self) -> np.ndarray:
-        """Index of the filter that hears each of the R numbers."""
+        """Index of the filter that receives each of the R numbers."""
         return np.repeat(np.arange(len(self.received)), self.received)
 
 
@@ -182,7 +193,7 @@ def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
-    """Gain, offset, spread, live rows and talking senders of one slot, as `Steps` has them."""
+    """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `Steps`."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
@@ -191,12 +202,13 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     for listener, links in slot.items():
         for sender, link in links.items():
             own_gain, own_offset, own_spread = link_moments(at(link, k))
+            # A listener receives the sum of its links: gains, offsets and spreads of independent links add.
             received = starts[listener] + np.arange(len(own_offset))
             sent = m * senders.index(sender) + np.arange(m)
             gain[np.ix_(received, sent)] = own_gain
             offset[received] += own_offset
             with_one = np.append(sent, columns)
-            spread[np.ix_(received, received, with_one, with_one)] += own_spread  # independent links: variances add
+            spread[np.ix_(received, received, with_one, with_one)] += own_spread
             live[received], talks[senders.index(sender)] = 1.0, 1.0
     return gain, offset, spread, live, talks
 
@@ -222,6 +234,7 @@ def _check_linear(plant: object, sensor: object) -> None:
 
 def _check_listener(network: RelayNetwork, number: int, listener: str, links: Links) -> None:
     where = f"slot {number}, {listener!r}"
+    # Names.
     if listener not in network.filters:
         raise fail(f"listener in slot {number}", f"one of {list(network.filters)}", repr(listener))
     for sender, link in links.items():
@@ -231,12 +244,11 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
             raise fail(f"{where}: link from {sender!r}", "a random affine map", type(first(link)).__name__)
         if first(link).past:
             raise fail(f"{where}: link from {sender!r}", "one without delays", f"one late by {first(link).past} steps")
+        # Sizes: a link takes what one sender sends, and all links of a listener deliver one length.
         takes, length = first(link).inputs, len(first(network.sensor).outputs)
         if takes != length:
             raise fail(f"{where}: link from {sender!r}", f"one that takes {length} numbers", f"one that takes {takes}")
-    sizes = {
-        first(link).outputs for slot in network.slots for link in slot.get(listener, {}).values()
-    }  # one filter, one length of what it hears
+    sizes = {first(link).outputs for slot in network.slots for link in slot.get(listener, {}).values()}
     if len(sizes) > 1:
         raise fail(f"links to {listener!r}", "one number of outputs", sorted(sizes))
 

@@ -22,9 +22,12 @@ from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 @readable
 class AbstractSensor(Module):
-    """A sensor y = h(x) + v with v independent over time and of everything else.
+    """Sensor y = h(x) + v with v independent over time and of everything else.
 
-    Outputs that are `circular` are angles in radians: y and y with a full turn more in one of them are the same.
+    Args:
+        noise: law of v.
+        outputs: names of the components of y.
+        circular: names of outputs that are angles in radians: y and y plus a full turn in one of them are the same.
     """
 
     noise: eqx.AbstractVar[AbstractNoise]
@@ -33,7 +36,7 @@ class AbstractSensor(Module):
 
     @property
     def angles(self) -> Angles:
-        """Which outputs are angles."""
+        """Indices of the outputs that are angles."""
         return tuple(self.outputs.index(name) for name in self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -52,11 +55,19 @@ class AbstractSensor(Module):
 
 
 class Sensor(AbstractSensor):
-    """A nonlinear sensor: `measure(x)` written with jax.numpy; `noise` a covariance, a variance or a noise law.
+    """Nonlinear sensor y = h(x) + v.
 
-    Say how many outputs there are by naming them, by a covariance matrix, or by a noise law; a single variance and no
-    names mean one output. `circular` names the outputs that are angles, in radians; a channel must leave them as they
-    are (gain 1), but for noise and losses that are told.
+    The number of outputs is that of their names, of the covariance matrix, or of the noise law; a single variance
+    without
+    names means one output.
+
+    Args:
+        measure: h(x), from (n,) to (outputs,), written with jax.numpy.
+        noise: law of v, its covariance (outputs, outputs), or a variance.
+        outputs: names of the outputs.
+        circular: names of outputs that are angles in radians; a channel must leave them unchanged (gain 1), but for
+            noise
+            and erasures.
 
     Raises:
         ValueError: names, noise and function that disagree about the number of outputs, circular outputs that are none.
@@ -135,7 +146,7 @@ def check_sensor(sensor: AbstractSensor, states: int) -> None:
 
 
 def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
-    """Whether both are linear, so that but for angles means and covariances propagate without approximation."""
+    """Return whether both are linear, so that but for angles means and covariances propagate without approximation."""
     return isinstance(first(plant), LinearPlant) and isinstance(first(sensor), LinearSensor)
 
 

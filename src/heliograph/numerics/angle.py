@@ -17,10 +17,15 @@ Angles = tuple[int, ...]  # which components are angles
 
 
 def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> Angles:
-    """Which of the `names` are angles.
+    """Return the indices of those `names` that are listed in `circular`.
+
+    Args:
+        name: what an error calls the list.
+        circular: names of angles.
+        names: all names, in the order of the components.
 
     Raises:
-        ValueError: a name that there is not, or one given twice.
+        ValueError: an unknown name, or a name listed twice.
     """
     given = [str(item) for item in items(name, circular, "names")]
     unknown = [item for item in given if item not in names]
@@ -30,9 +35,9 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
 
 
 def nearest(value: A, reference: Array, angles: Angles) -> A:
-    """The same angles (..., n), full turns taken off so that they are within half a turn of `reference` (..., n).
+    """Return the angles (..., n) with full turns removed, so that they lie within half a turn of `reference` (..., n).
 
-    What is no angle stays as it is.
+    Components that are no angles are unchanged.
     """
     if not angles:
         return value
@@ -44,18 +49,19 @@ def nearest(value: A, reference: Array, angles: Angles) -> A:
 
 
 def wrapped(value: A, angles: Angles) -> A:
-    """Angles between -pi and pi, (..., n)."""
+    """Return angles (..., n) between -pi and pi; other components are unchanged."""
     return nearest(value, np.zeros(np.shape(value)[-1]), angles)
 
 
 def continued(
     function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, result: Angles
 ) -> Callable[[jax.Array], jax.Array]:
-    """The function with what it finds of angles continued from `center`, so that no jump is taken for a change.
+    """Return the function with its angular results continued from `center`, so that no jump is taken for a change.
 
-    f(x) is taken near f(center) + D (x - center), D the whole turns that the angles found make with the angles given:
-    their derivatives, rounded. So an angle that is a given one and a little more follows it any number of turns, and
-    every other is taken within half a turn of that at the center.
+    f(x) is taken near f(center) + D (x - center), where D is the Jacobian of resulting angles by given angles, rounded
+    to
+    whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is taken
+    within half a turn of its value at the center.
     """
     if not result:
         return function

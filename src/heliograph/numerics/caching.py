@@ -1,4 +1,4 @@
-"""What was worked out of an object that never changes, kept as long as the object lives."""
+"""Results computed from an immutable object, cached as long as the object lives."""
 
 from collections.abc import Callable, Hashable
 from functools import wraps
@@ -17,10 +17,10 @@ T = TypeVar("T")
 
 
 def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-    """The function, which works out but once what it finds of each object that is its first argument.
+    """Return the function with its results cached for each object that is its first argument.
 
-    An object is known by itself, so that nothing is compared, and forgotten with it. What is found can no longer be
-    written to, since others have it too; what JAX traces is never kept.
+    An object is identified by `id`, so that nothing is compared, and its entries go with it. Cached arrays are made
+    read-only, since all callers share them; traced results are never cached.
     """
     results: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
 
@@ -31,15 +31,18 @@ def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, 
         if not given and first not in named:
             return function(*given, **named)  # which says what is missing
         item, rest = (given[0], given[1:]) if given else (named.pop(first), ())
+        # Key: identity of the object, and the other arguments.
         place, requested = id(item), (rest, tuple(named.items()))
         answers = results[place][1] if place in results else {}
         if requested in answers:
             return answers[requested]
         result = function(item, *rest, **named)
+        # A traced result belongs to one trace only.
         if is_traced(result):
             return result
         for leaf in jax.tree.leaves(result):
             _close(leaf)
+        # The weak reference removes the entry when the object is collected.
         answers[requested] = result
         results.setdefault(place, (ref(item, lambda _: results.pop(place, None)), answers))
         return result

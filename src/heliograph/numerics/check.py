@@ -23,7 +23,7 @@ PROBABILITY_TOLERANCE = 1e-9  # sums of decimal fractions such as .1 + .2 + .7
 
 
 class InputError(ValueError):
-    """What was given cannot be used; any other ValueError is a defect."""
+    """Input that cannot be used; any other ValueError is a defect of the package."""
 
 
 def fail(name: str, expected: str, got: object) -> InputError:
@@ -32,12 +32,12 @@ def fail(name: str, expected: str, got: object) -> InputError:
 
 
 def shown(value: object) -> str:
-    """Anything as a short part of one line."""
+    """Return anything as a short part of one line."""
     return " ".join(repr(value).split())[:60]
 
 
 def shown_error(error: Exception) -> str:
-    """An error as a short part of one line; of NumPy where JAX has to follow, what to write instead."""
+    """Return an error as a short part of one line; for NumPy where JAX has to trace, what to write instead."""
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return "one that calls NumPy: write it with jax.numpy"
     return " ".join(f"{type(error).__name__}: {error}".split())[:120]
@@ -69,7 +69,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
 
 
 def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
-    """A shape in words, with an example of a table where something else than one came."""
+    """Return a shape in words, with an example of a table where something else came."""
     lengths = ", ".join("any" if length is None else str(length) for length in shape)
     example = ", such as [[1, 0]]" if len(shape) == 2 and dimensions < 2 else ""
     return f"shape ({lengths}){example}"
@@ -106,7 +106,7 @@ def _range_words(low: float, high: float) -> str:
 
 
 def items(name: str, value: object, what: str) -> list[Any]:
-    """Return what a list, a tuple or the like holds; text and tables are none."""
+    """Return the items of a list, a tuple or another iterable; text, dictionaries and sets are refused."""
     try:
         if isinstance(value, str | bytes | Mapping | AbstractSet):
             raise TypeError
@@ -215,13 +215,13 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 
 def backwards(clock: np.ndarray) -> int | None:
-    """The first row whose time is before that of the row above."""
+    """Return the first row whose time is before that of the row above, None if there is none."""
     result = np.flatnonzero(clock[1:] < clock[:-1])
     return int(result[0]) + 1 if result.size else None
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
-    """What is wrong in that row."""
+    """Return the two times of that row and the row above in words."""
     now, before = (str(t) if clock.dtype.kind == "M" else f"{t:.10g}" for t in (clock[row], clock[row - 1]))
     return f"{now} after {before}"
 
@@ -234,6 +234,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     """
     tell_covariance(name, value)
     result = _numbers(name, value)
+    # A scalar c stands for c I.
     if dimension is not None and result.ndim == 0:
         result = array(name, result, ()) * np.eye(dimension)
     result = array(name, result, (dimension, dimension))
@@ -241,6 +242,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
         raise fail(name, "a square matrix", f"shape {result.shape}")
     if is_traced(result):
         return (result + result.T) / 2
+    # Symmetry and definiteness are judged of correlations, so that neither depends on units.
     unit = own_units(result)
     skew = np.abs(result - result.T)
     if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
@@ -252,9 +254,9 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
 
 
 def own_units(matrix: np.ndarray) -> np.ndarray:
-    """Standard deviations (..., n) of covariances (..., n, n), by which a matrix is judged in any units.
+    """Return standard deviations (..., n) of covariances (..., n, n), by which a matrix is judged in any units.
 
-    A component of variance zero has the least one that its entries beside the others could belong to, 1 if none.
+    A component of variance zero has the least deviation that its off-diagonal entries allow, 1 if all are zero.
     """
     diagonal = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
     others = np.where(diagonal > 0, diagonal, np.inf)

@@ -1,4 +1,4 @@
-"""What the compiler is asked: half of the compile time, for programs that run for seconds at most."""
+"""Compiler options that halve the compile time of programs that run for seconds at most."""
 
 from collections.abc import Callable
 from functools import cache, wraps
@@ -48,9 +48,9 @@ def _compiled(function: Callable[P, R], options: Callable[[], Options], donate: 
 
 @cache
 def understood() -> Options:
-    """Those of the options that this release of the compiler has: they are not part of its promises.
+    """Return those of the options that this release of the compiler knows: they are not part of its promises.
 
-    Without the level where JAX's flag jax_disable_most_optimizations is set, which an option would overrule.
+    The optimisation level is left out where JAX's flag jax_disable_most_optimizations is set, which it would overrule.
     """
     least = jax.config.values["jax_disable_most_optimizations"]
     return {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL) and _is_understood(name)}

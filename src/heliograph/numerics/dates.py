@@ -19,7 +19,7 @@ YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 
 def looks_like_date(text: str) -> bool:
-    """Whether a text begins as a date of ISO 8601 does."""
+    """Return whether a text begins like a date of ISO 8601."""
     return re.match(r"\d{4}-\d\d-", text) is not None
 
 
@@ -32,9 +32,11 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
     results, zones = [], set()
     for row, element in enumerate(texts, 1):
         text = element.isoformat() if hasattr(element, "isoformat") else "" if element is None else str(element).strip()
+        # A missing date is NaT.
         if not text or text == "NaT":
             results.append(MISSING)
             continue
+        # Nanoseconds since 1970 in UTC.
         match = DATE.fullmatch(text)
         try:
             if match is None:
@@ -43,6 +45,7 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
         except ValueError:
             expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
             raise fail(f"{name}, row {row}", expected, shown(text)) from None
+        # Local times and times with a zone cannot be compared.
         zones.add(match["zone"] is not None)
         if len(zones) > 1:
             raise fail(f"{name}, row {row}", "a zone with every date or with none", shown(text))

@@ -1,4 +1,4 @@
-"""Where a number may lie, and a start value that learns it from whatever checks it."""
+"""Domains of numbers, and arrays that learn their domain from the check that they pass through."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -19,13 +19,13 @@ SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
 
 
 class Marked(np.ndarray):
-    """An array that is told what it is for, once a check sees it; what is computed from it is told nothing."""
+    """Array that reports the domain that a check requires of it; arrays computed from it report nothing."""
 
     report: Callable[[str, Domain], None] | None = None
 
 
 def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
-    """A copy of an array that calls `told(name, domain)` when it is checked."""
+    """Return a copy of an array that calls `report(name, domain)` when it is checked."""
     result = np.array(value, dtype=np.float64).view(Marked)
     result.report = report
     return result

@@ -1,4 +1,4 @@
-"""A process forked from one in which JAX has run would wait for threads that it does not have: it is told so."""
+"""Refusal to run in a process forked after JAX has run, which would wait for threads that it does not have."""
 
 import os
 

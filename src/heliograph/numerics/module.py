@@ -1,4 +1,4 @@
-"""What all our models, filters and rules are: trees of arrays, with methods that cost no more than a call."""
+"""Base class of all models, filters and rules: trees of arrays, with methods that cost no more than a call."""
 
 import equinox as eqx
 

@@ -24,7 +24,7 @@ _kernel.multiple_results = True
 
 
 class _Kernel:
-    """What one kernel is: its arithmetic, that of its derivatives; compared by identity."""
+    """Arithmetic of one kernel and that of its derivatives; compared by identity."""
 
     def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree]):
         # Traced once per shapes, however many filters use it.
@@ -38,10 +38,13 @@ Shapes = Callable[..., PyTree]  # a kernel's arguments -> the shape of its resul
 def runs_last(
     kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None, shapes: Shapes | None = None
 ) -> Callable[P, R]:
-    """Have vmap put its axis last in every argument and result of a kernel; derivatives are those of its arithmetic.
+    """Return a kernel for which vmap puts its axis last in every argument and result.
 
-    Or of other arithmetic for the same: that of a kernel which branches on all runs at once, `where_any`, cannot be
-    mapped over runs. Where `shapes` says the results' shapes, the kernel need not be traced to find them.
+    Args:
+        kernel: arithmetic whose arrays carry the mapped axis last.
+        differentiable_as: arithmetic with the same values from which derivatives are taken; the kernel unless given. A
+            kernel that branches on all runs at once, by `where_any`, needs one, since it cannot be mapped over runs.
+        shapes: shapes of the results as a function of the arguments; without it the kernel is traced to find them.
     """
     this = _Kernel(kernel, kernel if differentiable_as is None else differentiable_as)
 
@@ -49,6 +52,7 @@ def runs_last(
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         leaves, tree = jax.tree.flatten((args, kwargs))
         leaves = [jnp.asarray(leaf) for leaf in leaves]
+        # Shapes and types of the results, by tracing where they are not stated.
         if shapes is None:
             item = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
         else:
@@ -56,6 +60,7 @@ def runs_last(
         declared, form = jax.tree.flatten(item)
         sizes = tuple((x.shape, x.dtype) for x in declared)
         x64 = bool(jnp.result_type(float) == np.float64)
+        # One primitive, so that its batching rule can move the mapped axis last.
         results = _kernel.bind(*leaves, kernel=this, tree=tree, declared=sizes, x64=x64, runs=())
         result: R = jax.tree.unflatten(form, results)
         return result

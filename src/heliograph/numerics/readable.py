@@ -1,4 +1,4 @@
-"""How an object of ours looks on a terminal and in a notebook, and when it equals another: one way for all of them."""
+"""Text representation and equality of the package's objects, one way for all of them."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
@@ -43,16 +43,17 @@ def _html(self: object) -> str:
 
 
 def _equal(self: object, other: object) -> bool:
-    """Of the same class and the same in every part, NaN like NaN."""
+    """Return whether both are of the same class and equal in every part; NaN equals NaN."""
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
         return same(self.__getstate__(), other.__getstate__())
     return same(self, other)
 
 
 def line(value: object, depth: int) -> str:
-    """Any value on one line: arrays by their size, what lies deeper than `depth` by its name."""
+    """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _array(value)
+    # Containers, item by item.
     if isinstance(value, Mapping) and not _ours(value):
         return _joined(
             "{", value.items(), len(value), depth, lambda item: f"{item[0]!r}: {line(item[1], depth - 1)}", "}"
@@ -60,6 +61,7 @@ def line(value: object, depth: int) -> str:
     if isinstance(value, tuple | list) and not _ours(value):
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
         return _joined(marks[0], value, len(value), depth, lambda item: line(item, depth - 1), marks[1])
+    # Objects with fields.
     if _ours(value) or is_dataclass(value):
         name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
         return _joined(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")

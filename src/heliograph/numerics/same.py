@@ -1,4 +1,4 @@
-"""Whether two things are the same in everything they hold: one answer, where arrays would give many."""
+"""Equality of two objects in everything they hold, as one bool where arrays would give many."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -11,10 +11,11 @@ import numpy as np
 
 
 def same(item: Any, other: Any) -> bool:
-    """One bool for objects that hold arrays: of the same class, and the same in each part.
+    """Return one bool for objects that hold arrays: of the same class, and the same in each part.
 
-    Arrays are the same if shape, kind of number and every number are; NaN is the same as NaN. What JAX traces is the
-    same as itself alone.
+    Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
+    same
+    as itself alone.
     """
     if item is other:
         return True
@@ -24,6 +25,7 @@ def same(item: Any, other: Any) -> bool:
         return _same_array(item, other)
     if type(item) is not type(other):
         return False
+    # Containers and dataclasses, part by part.
     if isinstance(item, Mapping):
         return item.keys() == other.keys() and all(same(item[key], other[key]) for key in item) and _rest(item, other)
     if isinstance(item, tuple | list):
@@ -32,6 +34,7 @@ def same(item: Any, other: Any) -> bool:
         return same((item.func, item.args, item.keywords), (other.func, other.args, other.keywords))
     if is_dataclass(item):
         return all(same(getattr(item, f.name, None), getattr(other, f.name, None)) for f in fields(item) if f.compare)
+    # Objects without an equality of their class are compared by their attributes.
     kind: Any = type(item)
     if kind.__eq__ is object.__eq__ and not callable(item) and getattr(item, "__dict__", None):
         return same(vars(item), vars(other))  # nobody has said when two of these are equal
@@ -39,7 +42,7 @@ def same(item: Any, other: Any) -> bool:
 
 
 def _rest(item: object, other: object) -> bool:
-    """What a dictionary of a class of its own holds beside its entries."""
+    """Compare the attributes that a subclass of dict has in addition to its entries."""
     return same(getattr(item, "__dict__", None), getattr(other, "__dict__", None))
 
 

@@ -49,7 +49,7 @@ def add(terms: Sequence[Array]) -> jax.Array:
 
 
 def minus(whole: jax.Array, parts: Iterable[jax.Array]) -> jax.Array:
-    """What is left of a whole without some parts, one by one."""
+    """Subtract all `parts` from `whole`, one by one."""
     return reduce(sub, parts, whole)
 
 
@@ -281,7 +281,7 @@ def _reciprocals(a: jax.Array) -> jax.Array:
 
 
 def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-    """Of each component what those before it do not say, x_i - sum_j L_ij y_j, and 1 / L_ii: y_i is their product."""
+    """Return numerators x_i - sum_j L_ij y_j and reciprocals 1 / L_ii of forward substitution; y_i is their product."""
     n = a.shape[0]
     if n > UNROLL_LIMIT:
         lower = root(a)

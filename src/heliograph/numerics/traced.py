@@ -17,7 +17,7 @@ import scipy.special
 
 
 def is_traced(*values: object) -> bool:
-    """Whether some number in these arrays or lists of numbers is traced."""
+    """Return whether some number in these arrays or lists of numbers is traced."""
     return any(
         isinstance(leaf, jax.core.Tracer)
         for value in values
@@ -27,34 +27,37 @@ def is_traced(*values: object) -> bool:
 
 
 def library(*values: object) -> Any:
-    """numpy for numbers that are known, jax.numpy where one is traced."""
+    """Return numpy for known numbers, jax.numpy where one is traced."""
     return jnp if is_traced(*values) else np
 
 
 def scipy_for(*values: object) -> Any:
-    """scipy, or jax.scipy where a number is traced."""
+    """Return scipy, or jax.scipy where a number is traced."""
     return jax.scipy if is_traced(*values) else scipy
 
 
 def plain(value: Any) -> float | jax.Array:
-    """A known number as a Python float, a traced one as it is."""
+    """Return a known number as a Python float, a traced one unchanged."""
     result: float | jax.Array = value if is_traced(value) else float(value)
     return result
 
 
 def stacked(parts: Sequence[object]) -> jax.Array | np.ndarray:
-    """Numbers or arrays of one shape along a new first axis."""
+    """Stack numbers or arrays of one shape along a new first axis."""
     result: jax.Array | np.ndarray = library(parts).stack(parts)
     return result
 
 
 def is_zero(value: Any) -> bool:
-    """Whether a number is known to be zero."""
+    """Return whether a number is known to be zero."""
     return not is_traced(value) and not np.any(value)
 
 
 def placed(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
-    """An array of zeros with `values` added at `places` (an index of its leading axes), repeated places included."""
+    """Return an array of zeros of shape `size` with `values` added at `places` (an index of its leading axes).
+
+    Values at repeated places add up.
+    """
     if is_traced(values):
         return jnp.zeros(size).at[places].add(values)
     result = np.zeros(size)

@@ -1,4 +1,4 @@
-"""What a channel is where nothing is lost."""
+"""The channel of complete packets: erasures removed."""
 
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -7,10 +7,10 @@ from heliograph.random_affine.erasure import Erasure
 
 
 def arrived(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """The channel given that all of it arrives, where losses say nothing of gains.
+    """Return the channel given that everything arrives, where losses are independent of gains.
 
     Raises:
-        ValueError: losses that tell which of several channels was drawn.
+        ValueError: losses that depend on which of several channels was drawn.
     """
     if not channel.erases:
         return channel

@@ -23,13 +23,24 @@ from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vect
 
 
 class GainAndNoise(AbstractRandomAffine):
-    """z = g A y + n: a scalar random gain g, a known matrix A and noise n, all independent."""
+    """Random affine map z = g A y + n with a scalar random gain g, a known matrix A and noise n, all independent.
+
+    Args:
+        law: law of the gain g; `Constant` for a known number.
+        matrix: A (m, p).
+        noise: law of n with m components, its covariance (m, m), or a variance that all components have.
+
+    Raises:
+        ValueError: a gain that is no law, shapes that do not fit, numbers that are not finite.
+    """
 
     law: AbstractLaw
     matrix: Matrix
     noise: AbstractNoise
 
-    def __init__(self, law: AbstractLaw, matrix: ArrayLike, noise: AbstractNoise | ArrayLike):
+    def __init__(
+        self, law: AbstractLaw, matrix: "Float[ArrayLike, 'm p']", noise: "AbstractNoise | Float[ArrayLike, '*m']"
+    ):
         if not isinstance(law, AbstractLaw):
             raise fail("gain of a hop", "a law (Constant for a number)", shown(law))
         self.law = law
@@ -57,19 +68,19 @@ class GainAndNoise(AbstractRandomAffine):
 
     @property
     def remembers(self) -> bool:
-        """It holds no map."""
+        """Always False: draws are independent over time."""
         return False
 
     @cached
     def moments(self, order: int) -> Moments:
-        """sum_k E[g^k] B_k, with the `gain_coefficients`."""
+        """Return sum_k E[g^k] B_k, with B_k the `gain_coefficients`."""
         gains = gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
         return Moments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
     @cached
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
-        """B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], where |b| = k."""
+        """Return B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], |b| = k."""
         rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         deterministic = symmetric_power(homogeneous(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
@@ -78,26 +89,26 @@ class GainAndNoise(AbstractRandomAffine):
         return placed((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """One map for each extreme law of the gain."""
+        """Return one map for each extreme law of the gain."""
         return tuple(GainAndNoise(law, self.matrix, self.noise) for law in self.law.extremes())
 
     def corner_count(self) -> int:
-        """Of the law."""
+        """Number of extreme laws of the gain."""
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """The moments with E[g^k] of each extreme law."""
+        """Return the moments with E[g^k] of each extreme law."""
         gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
         result: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
         return result
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """E[g] A y + n."""
+        """Return the map E[g] A y + n."""
         return GainAndNoise(self.law.mean_law(), self.matrix, self.noise)
 
 
 def homogeneous(matrix: Matrix) -> Matrix:
-    """[[A, 0], [0, 1]]."""
+    """Return [[A, 0], [0, 1]]."""
     outputs, inputs = matrix.shape
     right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
@@ -106,13 +117,17 @@ def homogeneous(matrix: Matrix) -> Matrix:
 
 
 def gain_moments(law: AbstractLaw, order: int) -> Vector:
-    """E[g^k] for k = 0, ..., order."""
+    """Return E[g^k] for k = 0, ..., order."""
     moment = law.moment  # of a module, whose methods are slow to look up
     return stacked([moment(k) for k in range(order + 1)])
 
 
-def known(matrix: ArrayLike, offset: ArrayLike | None = None) -> GainAndNoise:
-    """The deterministic map z = A y + b.
+def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | None" = None) -> GainAndNoise:
+    """Return the deterministic map z = A y + b.
+
+    Args:
+        matrix: A (m, p).
+        offset: b (m,), zero unless given.
 
     Raises:
         ValueError: shapes that do not fit, or numbers that are not finite.

@@ -1,4 +1,4 @@
-"""What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
+"""Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
@@ -45,21 +45,21 @@ class AbstractRandomAffine(Module):
 
     @property
     def erases(self) -> bool:
-        """Whether outputs can be NaN: lost, and the receiver knows."""
+        """True if outputs can be NaN: lost, and the receiver knows."""
         return False
 
     @property
     def past(self) -> int:
-        """Steps back of which it hears: its inputs are y_k, y_{k-1}, ..., y_{k-past}, one after another."""
+        """Largest delay in steps: the inputs are y_k, y_{k-1}, ..., y_{k-past}, stacked."""
         return max((part.past for part in held_maps(self)), default=0)
 
     @property
     def remembers(self) -> bool:
-        """Whether what is drawn depends on what was drawn before; unless told, whether a map held inside does."""
+        """True if a draw depends on earlier draws; by default, if a map among the fields remembers."""
         return any(part.remembers for part in held_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State before the first draw; () where the map forgets."""
+        """Draw the state before the first draw; () where the map forgets."""
         held = memories(self)
         if not held:
             return self._init(key)
@@ -67,7 +67,7 @@ class AbstractRandomAffine(Module):
         return begin(self, rest, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+        """Draw the next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
         held = memories(self)
         if not held:
             return self._draw(state, key)
@@ -75,13 +75,13 @@ class AbstractRandomAffine(Module):
         return advance(self, state, rest, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """`init` of a map that holds no modes."""
+        """Draw the initial state of a map that contains no modes."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """`draw` of a map that holds no modes."""
+        """Draw from a map that contains no modes."""
         if self.remembers:
             raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         if type(self).sample is AbstractRandomAffine.sample:
@@ -111,28 +111,28 @@ class AbstractRandomAffine(Module):
         raise NotImplementedError
 
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
-        """The maps at the corners of what is possible where probabilities are uncertain; itself when known."""
+        """Return the maps at the corners of the set of possible laws; the map itself when probabilities are known."""
         return (self,)
 
     def corner_count(self) -> int:
-        """Number of maps that `extremes` lists."""
+        """Return the number of maps that `extremes` lists."""
         return len(self.extremes())
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """E[Sym^order(H)] of each of the `extremes`."""
+        """Return E[Sym^order(H)] of each of the `extremes`."""
         return stacked([m.moments(order).matrix for m in self.extremes()])
 
     def mean_gain(self) -> "AbstractRandomAffine":
-        """The map that trusts each mean gain as the truth; noises stay."""
+        """Return the map whose gains are constant at their means; noises stay."""
         raise NotImplementedError
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
-        """A point at which moments can be compared with samples (a lifted map takes only lifted points)."""
+        """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
 
 
 def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """The maps in a map's fields, at any depth of lists, dictionaries and other modules, but not those inside them."""
+    """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
 
     def is_map(item: object) -> bool:
         return isinstance(item, AbstractRandomAffine)
@@ -141,17 +141,17 @@ def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 
 
 class AbstractModal(AbstractRandomAffine):
-    """A map that is drawn anew at each step by a law that depends on the state of a memory."""
+    """Random affine map whose law at each step depends on the state of a memory."""
 
     memory: eqx.AbstractVar[AbstractMemory]
 
     @property
     def remembers(self) -> bool:
-        """It does."""
+        """Always True."""
         return True
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """The map that forgets, for this state of the memory."""
+        """Return the map, without memory, for this state of the memory."""
         raise NotImplementedError
 
 
@@ -246,7 +246,7 @@ def _is_modal(item: object) -> bool:
 
 
 def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
-    """At least one random affine map."""
+    """Check that `maps` is a sequence of at least one random affine map, and return it as a tuple."""
     result = tuple(items(name, maps, "random affine maps"))
     if not result:
         raise fail(name, "at least one map", "none")

@@ -1,4 +1,4 @@
-"""Which of the numbers that a channel delivers are angles: an angle must come through as it is, or it is none."""
+"""Angles behind a channel: a number is an angle after it only if its gain is 1."""
 
 import numpy as np
 
@@ -17,10 +17,10 @@ ROUNDING = 1e-12  # of a gain of 1 that was computed
 
 
 def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
-    """Which outputs are angles, where those sent are: noise and losses that are told leave an angle one.
+    """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave an angle one.
 
     Raises:
-        ValueError: an angle that meets any gain but 1, or something else that is added.
+        ValueError: an angle with another gain than 1, or one that is added to something else.
     """
     if not sent:
         return ()
@@ -31,14 +31,16 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             for part in channel.maps:
                 sent = carried(part, sent)
             return sent
+        # Outputs of parts stand one after another.
         case Stack():
             starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
             items = zip(starts, channel.maps, strict=False)
             return tuple(int(start) + i for start, part in items for i in carried(part, sent))
         case Erasure() | OneStepLate():
             return carried(channel.base, sent)
-        case Delayed():  # what arrives is one angle that was sent; the delay itself, where it is told, comes after it
+        case Delayed():  # one of the angles that were sent arrives; a time stamp stands after it
             return carried(channel.link, sent)
+        # All choices must agree.
         case Mixture() | Modes():
             results = {carried(part, sent) for part in channel.maps}
             if len(results) == 1:

@@ -1,4 +1,4 @@
-"""What links remember: a chain of modes, or a fading that drifts. It moves by itself, whatever is sent."""
+"""Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent."""
 
 from copy import copy
 from functools import cache
@@ -25,10 +25,11 @@ Law = Float[jax.Array | np.ndarray, " modes"]
 
 
 class Nodes(NamedTuple):
-    """A memory as finitely many states: their law at the first use, and row by row that of the next given the present.
+    """Finitely many states of a memory: their law at the first use, and row by row that of the next given the present.
 
     The rows sum to 1. Their entries are probabilities for a chain; for a drifting fading they reproduce all
-    expectations of polynomials up to a degree, and may be negative.
+    expectations
+    of polynomials up to a degree, and may be negative.
     """
 
     states: jax.Array | np.ndarray
@@ -39,17 +40,17 @@ class Nodes(NamedTuple):
 
 @readable
 class AbstractMemory(Module):
-    """A state that moves from step to step and on which the law of what is drawn depends.
+    """Memory of a link: a state that moves from step to step, on which the law of gain and noise depends.
 
-    Links that hold one memory share it: they are in one shadow. One memory is the same object, or the same `name`; the
-    name also keys its draws, so that nodes of a network that share a memory need one.
+    Links that refer to one memory share it (shared fading). One memory is the same object, or the same `name`; the name
+    also seeds its draws, so that nodes of a network that share a memory need one.
     """
 
     name: eqx.AbstractVar[str | None]
     identity: eqx.AbstractVar[str]
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the state at the first use."""
+        """Draw the initial state."""
         raise NotImplementedError
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
@@ -72,7 +73,7 @@ class AbstractMemory(Module):
         raise NotImplementedError
 
     def labelled(self, label: str) -> "AbstractMemory":
-        """A twin that no link holds yet: told from others by `label` alone."""
+        """Return a copy that no link refers to yet, identified by `label` alone."""
         twin = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(twin, "name", None)
         object.__setattr__(twin, "identity", label)
@@ -80,13 +81,16 @@ class AbstractMemory(Module):
 
 
 class MarkovChain(AbstractMemory):
-    """Modes 0, 1, ..., of which the next depends on the present one: transition[i, j] = P(next j | now i).
+    """Markov chain of modes 0, 1, ...: transition[i, j] = P(next mode j | present mode i).
 
-    initial: law of the mode at the first use; the stationary law unless given. Where the transition varies in time
-    (channels in `over_time`), that of step k leads from step k to step k + 1. radius: each probability may be off by
-    this much, differently at each step.
-
-    Shapes: transition (modes, modes), initial (modes,).
+    Args:
+        transition: probabilities (modes, modes), each row a law. Where it varies in time (channels in `over_time`),
+            that of
+            step k leads from step k to step k + 1.
+        initial: law (modes,) of the mode at the first use; the stationary law unless given.
+        name: name by which copies and nodes of a network share the chain; None for a chain of its own.
+        radius: how far each probability may be off, differently at each step; one number or (modes, modes), 0 unless
+            given.
 
     Raises:
         ValueError: rows that are no probabilities; no initial law, and more than one stationary law.
@@ -100,10 +104,10 @@ class MarkovChain(AbstractMemory):
 
     def __init__(
         self,
-        transition: ArrayLike,
-        initial: ArrayLike | None = None,
+        transition: "Float[ArrayLike, 'modes modes']",
+        initial: "Float[ArrayLike, ' modes'] | None" = None,
         name: str | None = None,
-        radius: ArrayLike = 0.0,
+        radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
         tell("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, (None, None))
@@ -143,7 +147,11 @@ class MarkovChain(AbstractMemory):
 
 
 class Autoregression(AbstractMemory):
-    """A standard Gaussian that drifts, c+ = rho c + sqrt(1 - rho^2) e, stationary from the first use on.
+    """Gaussian memory with mean 0 and variance 1 that drifts, c+ = rho c + sqrt(1 - rho^2) e, always stationary.
+
+    Args:
+        correlation: rho between one step and the next, from -1 to 1.
+        name: name by which copies and nodes of a network share the memory; None for one of its own.
 
     Raises:
         ValueError: a correlation outside [-1, 1].
@@ -153,7 +161,7 @@ class Autoregression(AbstractMemory):
     name: str | None = eqx.field(static=True)
     identity: str = eqx.field(static=True)
 
-    def __init__(self, correlation: ArrayLike, name: str | None = None):
+    def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
         self.name, self.identity = name, _identity(name)
 
@@ -216,7 +224,7 @@ def stationary(transition: Rows) -> Law:
 
 
 def _identity(name: str | None) -> str:
-    """What tells memories apart, through copies and in other processes; no draw depends on it."""
+    """Return the text that identifies a memory, through copies and in other processes; no draw depends on it."""
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))
     return uuid4().hex if name is None else f"named {name}"

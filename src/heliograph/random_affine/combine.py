@@ -33,18 +33,18 @@ Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
 
 
 class _Parts(AbstractRandomAffine):
-    """What holds several maps: its state is the tuple of theirs, and all of them move at each draw."""
+    """Map made of several maps: its state is the tuple of theirs, and all of them move at each draw."""
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
 
     @property
     def erases(self) -> bool:
-        """Whether one of the maps does."""
+        """True if one of the maps erases."""
         return any(m.erases for m in self.maps)
 
     @property
     def remembers(self) -> bool:
-        """Whether one of the maps does."""
+        """True if one of the maps remembers."""
         return any(m.remembers for m in self.maps)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -62,7 +62,11 @@ class _Parts(AbstractRandomAffine):
 
 
 class Series(_Parts):
-    """One map after another, independent: z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k]."""
+    """Series of independent maps, z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k].
+
+    Args:
+        maps: the maps, first the one that takes y; each takes as many inputs as the one before has outputs.
+    """
 
     maps: tuple[AbstractRandomAffine, ...]
 
@@ -126,12 +130,23 @@ def _after(second: jax.Array, first: jax.Array) -> jax.Array:
 
 
 class Mixture(_Parts):
-    """One of several maps, chosen at random at each step; moments are linear in the (possibly uncertain) weights."""
+    """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
+
+    Args:
+        maps: maps of one shape.
+        weights: their probabilities (maps,).
+        radius: how far each probability may be off; one number or (maps,), 0 unless given.
+    """
 
     maps: tuple[AbstractRandomAffine, ...]
     choice: Discrete
 
-    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: ArrayLike, radius: ArrayLike = 0.0):
+    def __init__(
+        self,
+        maps: Sequence[AbstractRandomAffine],
+        weights: "Float[ArrayLike, ' maps']",
+        radius: "Float[ArrayLike, '*maps']" = 0.0,
+    ):
         self.maps = as_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         if len({(m.outputs, m.inputs) for m in self.maps}) != 1:

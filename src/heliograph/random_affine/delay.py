@@ -1,4 +1,4 @@
-"""Links that hear late: at step k what was sent d steps before, with d known or drawn, told or not."""
+"""Delayed links: at step k arrives what was sent d steps before, with d constant, drawn or a chain, stamped or not."""
 
 from typing import TypeVar
 
@@ -21,11 +21,11 @@ T = TypeVar("T")
 
 
 class AbstractOfLine(AbstractRandomAffine):
-    """A map of the line (y_k, y_{k-1}, ..., y_{k-past}), one after another."""
+    """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The same as a plain map, of which all that the line holds is the present."""
+        """Return the same map as one without delay, whose input is the whole line."""
         raise NotImplementedError
 
     @property
@@ -40,7 +40,7 @@ class AbstractOfLine(AbstractRandomAffine):
 
     @property
     def erases(self) -> bool:
-        """Whether the map does."""
+        """True if the map of the line erases."""
         return self.line.erases
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -52,11 +52,11 @@ class AbstractOfLine(AbstractRandomAffine):
         return self.line.draw(state, key)
 
     def moments(self, order: int) -> Moments:
-        """Those of the map."""
+        """Return the moments of the map of the line."""
         return self.line.moments(order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Those of the map."""
+        """Return the extremes of the map of the line."""
         return tuple(OfLine(m, self.past) for m in self.line.extremes())
 
     def corner_count(self) -> int:
@@ -86,18 +86,23 @@ class OfLine(AbstractOfLine):
 
 
 class Delayed(AbstractOfLine):
-    """z_k = G_k y_{k-d} + n_k: a link that hears at step k what was sent d steps before.
+    """Delayed link z_k = G_k y_{k-d} + n_k: at step k arrives what was sent d steps before.
 
-    Of the line its mean gain is E[G] sum_d p_d S_d, where S_d chooses y_{k-d}, and its spread that of the mixture.
-    Before the first step zeros were sent. `timestamped`: d is received too, as the last number.
+    As a map of the line its mean gain is E[G] sum_d p_d S_d, where S_d selects y_{k-d}, and its spread that of the
+    mixture. Before the first step zeros were sent.
+
+    Args:
+        link: the link without delay.
+        delay: d in steps; a `Discrete` law from which d is drawn at each step; or a `MarkovChain` whose mode is d.
+        timestamped: True if d is received too, as the last number; False unless given.
 
     Raises:
-        ValueError: a delay that is no whole number of steps from 0, a law of it whose values are none, a link that is
-            late itself (put links in series with `amplify_and_forward`).
+        ValueError: a delay that is no whole number of steps from 0, a law of it with other values, a link that is late
+            itself (put links in series with `amplify_and_forward`).
     """
 
     link: AbstractRandomAffine
-    delay: AbstractRandomAffine  # from the line to what the link hears, and to d where it is told
+    delay: AbstractRandomAffine  # from the line to the link's input, and to d where it is stamped
     times: tuple[int, ...] = eqx.field(static=True)
     timestamped: bool = eqx.field(static=True)
 
@@ -131,11 +136,11 @@ class Delayed(AbstractOfLine):
 
     @property
     def constant(self) -> bool:
-        """Whether the delay never varies."""
+        """True if the delay never varies."""
         return isinstance(self.delay, GainAndNoise)
 
     def given(self, d: int) -> AbstractRandomAffine:
-        """The map of the line without the told number, for one delay."""
+        """Return the map of the line for one delay d, without the time stamp."""
         return Series([_chosen(d, self.past, self.link.inputs, False), self.link])
 
 

@@ -33,7 +33,7 @@ class Erasure(AbstractRandomAffine):
 
     @property
     def erases(self) -> bool:
-        """It does."""
+        """Always True."""
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -48,7 +48,7 @@ class Erasure(AbstractRandomAffine):
         return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
     def moments(self, order: int) -> Moments:
-        """There are none: a filter skips what was lost, and asks for the moments of what arrives.
+        """Refuse: a filter skips lost packets, and asks for the moments of the channel inside.
 
         Raises:
             ValueError: always.

@@ -50,10 +50,10 @@ def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
 
 
 def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
-    """Whether the best linear filter that knows of no memory is the best of all: Cov(Hbar_k, Hbar_l) = 0 for k < l.
+    """Return whether the linear filter that ignores memory is the best linear one: Cov(Hbar_k, Hbar_l) = 0 for k < l.
 
     Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
-    steps, and lags up to the number of modes decide, since Pi^t is a combination of those before.
+    steps, and lags up to the number of modes decide, since Pi^t is a combination of lower powers (Cayley-Hamilton).
     """
     items = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
     if constant and not np.allclose(steps[0].initial @ steps[0].transition, steps[0].initial, rtol=0, atol=ROUNDING):

@@ -1,4 +1,4 @@
-"""Links in series that hear late: delays add up, and relays that are late by chance hold what they heard."""
+"""Delayed links in series: constant delays add up, and relays with random delays store what they received."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,10 @@ from heliograph.random_affine.modes import Modes
 
 
 class Held(AbstractRandomAffine):
-    """What a relay heard at this step and at `steps` before, (r_k, ..., r_{k-steps}), of the line of what was sent.
+    """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
-    It remembers what was drawn: forwarded twice, a value has its gain and noise twice. Before the first step it holds
-    zeros.
+    A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.
+    Before the first step it holds zeros.
     """
 
     base: AbstractRandomAffine
@@ -34,7 +34,7 @@ class Held(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """All that is held."""
+        """Number of values that are stored."""
         return self.base.outputs * (1 + self.steps)
 
     @property
@@ -44,20 +44,20 @@ class Held(AbstractRandomAffine):
 
     @property
     def erases(self) -> bool:
-        """Whether what the relay hears can be lost."""
+        """True if what the relay receives can be lost."""
         return self.base.erases
 
     @property
     def remembers(self) -> bool:
-        """It does."""
+        """Always True."""
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the map, and nothing heard."""
+        """Draw the state of the map, with zeros received before."""
         return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw what is heard now, and put it before what was."""
+        """Draw the present reception, and put it before the earlier ones."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
         items = jnp.concatenate([h[None, :-1], before])
@@ -70,18 +70,18 @@ class Held(AbstractRandomAffine):
 
 
 class Relayed(AbstractOfLine):
-    """Links in series of which each but the first hears late, by chance, what the one before delivered."""
+    """Links in series, each but the first with a random delay of what the one before delivered."""
 
     stages: tuple[AbstractRandomAffine, ...]
 
     @property
     def remembers(self) -> bool:
-        """It does: what the relays hold."""
+        """Always True: relays store what they received."""
         return True
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """Each stage of what the one before holds."""
+        """Return the stages in series, each fed by the storage of the one before."""
         size, result = sent(self.stages[0]), of_line(self.stages[0])
         for stage in self.stages[1:]:
             result = Series([Held(result, size, stage.past), of_line(stage)])
@@ -94,17 +94,20 @@ class Relayed(AbstractOfLine):
 
 
 def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """One link after another, each late by its own; constant delays add up.
+    """Return links in series, each with its own delay; constant delays add up.
 
-    A relay that forgets and holds what it heard for d steps is one that hears it d steps later: its gains and noises
-    are independent over time. One that holds it for a random time may forward one value twice, with one noise.
+    A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
+    gains
+    and noises are independent over time. One that stores it for a random time may forward one value twice, with one
+    noise.
 
     Raises:
-        ValueError: no links, delays told on the way, memory before a delay.
+        ValueError: no links, time stamps on the way, memory before a delay.
     """
     links = as_maps("series", links)
     if not any(link.past for link in links):
         return Series(links)
+    # A stage is a link with a random delay and all that follow it with constant ones.
     stages: list[list[AbstractRandomAffine]] = [[links[0]]]
     for link in links[1:]:
         if link.past and not isinstance(link, Delayed):
@@ -113,6 +116,7 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
             stages.append([link])
         else:
             stages[-1].append(link)
+    # Only random delays after the first stage need storage.
     if len(stages) == 1:
         return _stage(stages[0])
     if any(isinstance(link, Delayed) and link.timestamped for link in links):
@@ -121,12 +125,13 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
 
 
 def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """Links in series of which only the first may be late by chance."""
+    """Return links in series of which only the first may have a random delay."""
     delays = [link for link in links if isinstance(link, Delayed)]
     if not delays:
         return Series(links)
     if links[0].past and not isinstance(links[0], Delayed):
         raise fail("series", "links that are late each by itself", "a combination of late links")
+    # The random delay comes first; constant ones are added to it.
     start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
     timestamped = [link.timestamped for link in delays]
     if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and start is not None):

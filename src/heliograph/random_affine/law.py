@@ -42,15 +42,15 @@ class AbstractLaw(Module):
         raise NotImplementedError
 
     def extremes(self) -> tuple["AbstractLaw", ...]:
-        """Laws at the corners of what is possible; the law itself when it is known."""
+        """Return the laws at the corners of the set of possible laws; the law itself when it is known."""
         return (self,)
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
-        """E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
         return stacked([stacked([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
 
     def mean_law(self) -> "Constant":
-        """The law that a filter trusts which takes the mean gain as the truth."""
+        """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
         return Constant(self.moment(1))
 
 
@@ -59,7 +59,7 @@ class Constant(AbstractLaw):
 
     value: Scalar
 
-    def __init__(self, value: ArrayLike):
+    def __init__(self, value: "Float[ArrayLike, '']"):
         self.value = scalar("constant gain", value)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -135,6 +135,7 @@ class Discrete(AbstractLaw):
         low = np.maximum(self.probabilities - self.radius, 0.0)
         high = np.minimum(self.probabilities + self.radius, 1.0)
         corners = set()
+        # A vertex has all uncertain probabilities but one at an end; the one left makes the sum 1.
         for slack in free:
             others = [i for i in free if i != slack]
             for ends in product(*((low[i], high[i]) for i in others)):
@@ -147,8 +148,12 @@ class Discrete(AbstractLaw):
         return np.array([np.array(c) / sum(c) for c in sorted(corners)])
 
 
-def bernoulli(probability: ArrayLike, radius: ArrayLike = 0.0) -> Discrete:
-    """A link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
+def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']" = 0.0) -> Discrete:
+    """Return the law of a link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
+
+    Args:
+        probability: P(gain 1), from 0 to 1.
+        radius: how far the probability may be off, 0 unless given.
 
     Raises:
         ValueError: a probability outside [0, 1], or a radius that it does not allow.
@@ -256,9 +261,12 @@ class LogNormal(AbstractLaw):
 
 
 class GivenMoments(AbstractLaw):
-    """A gain of which only the moments E[g], E[g^2], ... are known, from measurements or from a data sheet.
+    """Law of a gain of which only the moments are known, from measurements or from a data sheet.
 
     It designs filters but cannot be sampled: many laws share these moments.
+
+    Args:
+        moments: E[g], E[g^2], ..., shape (order,).
 
     Raises:
         ValueError: no distribution on the real line has these moments (a Hankel matrix is indefinite), or a moment of
@@ -267,12 +275,13 @@ class GivenMoments(AbstractLaw):
 
     moments: Vector
 
-    def __init__(self, moments: ArrayLike):
+    def __init__(self, moments: "Float[ArrayLike, ' order']"):
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):
             return
         sequence = np.concatenate([[1.0], self.moments])
         half = (len(sequence) - 1) // 2
+        # Moments of a distribution have a positive semidefinite Hankel matrix E[V V'], V = (1, g, g^2, ...).
         hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
         scale = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
         smallest = np.linalg.eigvalsh(hankel / np.outer(scale, scale))[0]

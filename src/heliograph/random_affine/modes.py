@@ -1,4 +1,4 @@
-"""Maps whose law depends on a memory, and any map made of them as one chain with a map that forgets for each mode."""
+"""Maps whose law depends on a memory, and any combination of them as one chain with one map for each mode."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -70,11 +70,11 @@ class Modes(AbstractModal):
 
     @property
     def erases(self) -> bool:
-        """Whether one of the maps does."""
+        """True if one of the maps erases."""
         return any(m.erases for m in self.maps)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """The map of this mode; of a traced one, a map with its numbers, or if they differ in kind a choice of maps."""
+        """Return the map of this mode; for a traced mode, one with its numbers, or a choice among maps of several kinds."""
         if isinstance(state, int | np.integer):
             return self.maps[state]
         leaves, trees = zip(*(jax.tree.flatten(m) for m in self.maps), strict=True)
@@ -113,14 +113,14 @@ class _Chosen(AbstractRandomAffine):
 
 
 class ModeOutput(AbstractModal):
-    """z = the state of a memory, told as a number; what is sent is not heard."""
+    """Side information z = the state of a memory as a number; what is sent does not enter."""
 
     memory: AbstractMemory
     sent: int = eqx.field(static=True)
 
     @property
     def outputs(self) -> int:
-        """One."""
+        """Always one."""
         return 1
 
     @property
@@ -129,12 +129,12 @@ class ModeOutput(AbstractModal):
         return self.sent
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """The number alone."""
+        """Return the constant map to this state."""
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
 
 
 class OneStepLate(AbstractRandomAffine):
-    """A map of which a step hears what was drawn at the step before; nothing (NaN) at the first."""
+    """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine
 
@@ -150,12 +150,12 @@ class OneStepLate(AbstractRandomAffine):
 
     @property
     def erases(self) -> bool:
-        """It does, at the first step."""
+        """Always True, because of the first step."""
         return True
 
     @property
     def remembers(self) -> bool:
-        """It does."""
+        """Always True."""
         return True
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -170,9 +170,14 @@ class OneStepLate(AbstractRandomAffine):
 
 
 class Faded(AbstractModal):
-    """z = (mean + deviation c) A y + n, with c a standard Gaussian that drifts (`Autoregression`).
+    """Drifting fading z = (mean + deviation c) A y + n, with c a standard Gaussian that drifts (`Autoregression`).
 
-    Shapes: matrix A (outputs, inputs).
+    Args:
+        drift: the memory c.
+        mean: mean of the gain.
+        deviation: standard deviation of the gain.
+        matrix: A (m, p).
+        noise: law of n with m components, its covariance (m, m), or a variance that all components have.
 
     Raises:
         ValueError: a negative deviation, shapes that do not fit, numbers that are not finite.
@@ -187,10 +192,10 @@ class Faded(AbstractModal):
     def __init__(
         self,
         drift: Autoregression,
-        mean: ArrayLike,
-        deviation: ArrayLike,
-        matrix: ArrayLike,
-        noise: AbstractNoise | ArrayLike,
+        mean: "Float[ArrayLike, '']",
+        deviation: "Float[ArrayLike, '']",
+        matrix: "Float[ArrayLike, 'm p']",
+        noise: "AbstractNoise | Float[ArrayLike, '*m']",
     ):
         if not isinstance(drift, Autoregression):
             raise fail("drift", "an Autoregression", shown(drift))
@@ -215,14 +220,16 @@ class Faded(AbstractModal):
 
 
 class JointModes(Module):
-    """A map as one chain and one map that forgets for each of its modes.
+    """Map as one chain and one map without memory for each of its modes.
 
     Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
-    `transition` need not be probabilities. A map that forgets has one mode.
+    `transition` need not be probabilities. A map without memory has one mode.
 
-    radius: each transition may be off by this much, differently at each step.
-
-    Shapes: initial (modes,), transition and radius (modes, modes).
+    Args:
+        initial: law of the mode at the first step (modes,).
+        transition: law of the next mode by present mode (modes, modes).
+        radius: how far each transition may be off, differently at each step (modes, modes).
+        maps: the map in each mode.
     """
 
     initial: Law
@@ -231,20 +238,27 @@ class JointModes(Module):
     maps: tuple[AbstractRandomAffine, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
-        """E[Sym^order(H) | mode] of each mode; times transition[i, j] it is the block (j, i) of the joint moments."""
+        """Return E[Sym^order(H) | mode] of each mode; times transition[i, j], it is block (j, i) of joint moments."""
         return stacked([m.moments(order).matrix for m in self.maps])
 
 
 def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1) -> JointModes:
-    """The memories of a map as one chain, the first slowest: transition Pi_a x Pi_b (Kronecker), and the map given it.
+    """Combine the memories of a channel in one chain, the first slowest, with the map given each joint mode.
 
-    f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j); of maps that share one, f(a_i, b_i). Fading
-    that drifts has as many nodes as make exact, of H's monomials up to `order`, the means in each mode and the products
-    over time; given `nodes`, it is the chain of that many modes with the same mean, variance and correlation, which has
-    probabilities.
+    The transition is Pi_a x Pi_b (Kronecker). f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j);
+    of
+    maps that share one, f(a_i, b_i).
+
+    Args:
+        channel: any map.
+        nodes: number of modes of a drifting fading, which then becomes the chain with the same mean, variance and
+            correlation, with probabilities. None (default): as many nodes as make the means in each mode and the
+            products
+            over time exact for monomials of H up to `order`; their transition may have negative entries.
+        order: degree of H for which expectations are exact, 1 unless given.
 
     Raises:
-        ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
+        ValueError: more than MODES modes, or a map inside with a memory of another kind.
     """
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
@@ -254,6 +268,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
     xp = library(items)
+    # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [item.initial for item in items], np.ones(1))
     transition = reduce(xp.kron, [item.transition for item in items], np.ones((1, 1)))
     maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(item.states for item in items)))
@@ -270,7 +285,7 @@ def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
 
 
 def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
-    """Degree of H, as a polynomial in the state of a memory: one for each map in series that it fades."""
+    """Return the degree of H as a polynomial in the state of a memory: one for each map in series that it fades."""
     match channel:
         case AbstractModal():
             return int(channel.memory.identity == identity)

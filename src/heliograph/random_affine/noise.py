@@ -27,9 +27,13 @@ Square = Float[jax.Array | np.ndarray, "n n"]
 
 @readable
 class AbstractNoise(Module):
-    """A law of a noise vector, independent over time and of everything else.
+    """Law of a noise vector n, independent over time and of everything else.
 
     Its parameters are numbers, or traced by JAX: then so are its moments.
+
+    Args:
+        mean: E[n] (dimension,).
+        covariance: Cov n (dimension, dimension).
     """
 
     mean: eqx.AbstractVar[Vector]
@@ -92,10 +96,11 @@ class Gaussian(AbstractNoise):
 
 
 def _root(covariance_: Square) -> np.ndarray:
-    """A with A A' = S from eigenvectors of S; of its correlations, where those of S lose digits of a component's own.
+    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
 
-    An eigenvalue is known to rounding of the largest one, so that a component in small units would be lost; one that is
-    no more than that is zero, since its root, of 1e-8, would be heard where a combination has no noise.
+    Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
+    eigenvalue
+    below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that have none.
     """
     matrix = np.asarray(covariance_)
     deviation = np.sqrt(np.diagonal(matrix))
@@ -110,14 +115,19 @@ def _root(covariance_: Square) -> np.ndarray:
 
 
 class FiniteSupport(AbstractNoise):
-    """Noise that takes the vectors `atoms` (atom, component) with `probabilities`."""
+    """Noise with finitely many values.
+
+    Args:
+        atoms: the values (atom, component).
+        probabilities_: their probabilities (atom,).
+    """
 
     atoms: Matrix
     probabilities: Vector
     mean: Vector
     covariance: Square
 
-    def __init__(self, atoms: ArrayLike, probabilities_: ArrayLike):
+    def __init__(self, atoms: "Float[ArrayLike, 'atom component']", probabilities_: "Float[ArrayLike, ' atom']"):
         self.atoms = array("noise atoms", atoms, (None, None))
         self.probabilities = probabilities("noise probabilities", probabilities_, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
@@ -169,9 +179,11 @@ class Independent(AbstractNoise):
 
 
 class Shaped(AbstractNoise):
-    """n = B u: a noise u that enters through a known matrix B, as process noise does.
+    """Noise n = B u: a noise u that enters through a known matrix B, as process noise does.
 
-    Shapes: matrix (dimension, source.dimension).
+    Args:
+        matrix: B (dimension, source.dimension).
+        source: law of u.
     """
 
     matrix: Matrix
@@ -179,7 +191,7 @@ class Shaped(AbstractNoise):
     mean: Vector
     covariance: Square
 
-    def __init__(self, matrix: ArrayLike, source: AbstractNoise):
+    def __init__(self, matrix: "Float[ArrayLike, 'dimension source']", source: AbstractNoise):
         instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
         self.matrix = array("noise matrix", matrix, (None, source.dimension))
         self.source = source
@@ -227,7 +239,7 @@ def as_noise(name: str, value: AbstractNoise | ArrayLike, dimension: int) -> Abs
 
 
 def components(value: AbstractNoise | ArrayLike) -> int | None:
-    """How many components a noise law or a covariance has; None for a number, which says a variance alone."""
+    """Return the number of components of a noise law or covariance; None for a number, which is a variance alone."""
     if isinstance(value, AbstractNoise):
         return value.dimension
     try:

@@ -1,4 +1,4 @@
-"""What a receiver is told of a channel with erasures: every set of losses, its probability, and the map it leaves."""
+"""Outcomes of a channel with erasures: every set of losses, its probability, and the map that remains."""
 
 from collections.abc import Callable
 from functools import reduce
@@ -20,7 +20,7 @@ OUTCOME_LIMIT = 1024  # sets of losses that are listed
 
 
 class Outcome(NamedTuple):
-    """One thing that a receiver may be told: with `probability` the outputs in `arrived` come through `map`."""
+    """Set of losses that the receiver can observe: with `probability` the outputs in `arrived` come through `map`."""
 
     probability: float | jax.Array
     map: AbstractRandomAffine
@@ -28,7 +28,7 @@ class Outcome(NamedTuple):
 
 
 def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
-    """Every set of losses of a channel that forgets; outcomes of probability 0 are left out.
+    """List every set of losses of a channel without memory; outcomes of probability 0 are left out.
 
     Raises:
         ValueError: a channel that remembers, erasures inside a map that is no series or stack, more than OUTCOME_LIMIT
@@ -39,9 +39,11 @@ def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
         return [Outcome(1.0, channel, np.ones(channel.outputs, dtype=bool))]
     match channel:
         case Erasure():
+            # Either what the base delivers, or nothing.
             arrival, lost = plain(channel.arrival), np.zeros(channel.outputs, dtype=bool)
             results = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
             results.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
+        # Losses of independent parts: probabilities multiply.
         case Series():
             results = reduce(lambda done, part: _joint(done, outcomes(part), _after), channel.maps[1:],
                            outcomes(channel.maps[0]))  # fmt: skip
@@ -62,7 +64,7 @@ def _joint(
 
 
 def _after(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """y hears x: an output is lost where y loses it or has a gain on what x lost."""
+    """Join outcomes in series: an output is lost where y loses it or has a gain on what x lost."""
     received = known(np.diag(x.arrived.astype(float)))
     power = second_moments(y.map)[1][..., :-1, :-1]  # E[G_ia G_jb]
     uses = np.einsum("iiaa->ia", power) > 0
@@ -70,14 +72,14 @@ def _after(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
 
 
 def _others(x: Outcome, y: Outcome) -> tuple[AbstractRandomAffine, np.ndarray]:
-    """Both, one above the other."""
+    """Join outcomes of parallel maps, stacked."""
     return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 
 
 def second_moments(
     channel: AbstractRandomAffine,
 ) -> tuple[Float[np.ndarray, "m p+1"], Float[np.ndarray, "m m p+1 p+1"]]:
-    """E[(G, n)] and the tensor of E[z z' | y] on (y, 1)(y, 1)', under the nominal law."""
+    """Return E[(G, n)] and the tensor of E[z z' | y] on (y, 1)(y, 1)', under the nominal law."""
     moments = channel.moments(2)
     tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     return np.asarray(moments.mean[:-1]), np.asarray(tensor)

@@ -31,7 +31,7 @@ class Recomputed(NamedTuple):
 
 
 class _Observation(NamedTuple):
-    """What one filter hears: mean map and E z z' = raw_ij : (sent, 1)(sent, 1)'."""
+    """Reception of one filter: mean map and E z z' = raw_ij : (sent, 1)(sent, 1)'."""
 
     mean: Float[np.ndarray, "p sent+1"]
     raw: Float[np.ndarray, "p p sent+1 sent+1"]
@@ -47,6 +47,7 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     if set(gains) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     (mean, spread), n = network.initial(), len(network.states)
+    # q = (1, x, s_1, ..., s_F): raw moments E q q', and the maps to e_f = x - s_f.
     filters, start = network.filters, np.concatenate([[1.0], np.tile(mean, 1 + len(network.filters))])
     raw = np.outer(start, start)
     raw[1 : 1 + n, 1 : 1 + n] += spread
@@ -56,6 +57,7 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     history, correlation = [raw], []
     by_filter = [np.asarray(gains[name], dtype=np.float64) for name in filters]
     for k in range(len(by_filter[0])):
+        # One step of E q q'; innovations must be uncorrelated with errors.
         raw, result = _step(network, k, raw, [gain[k] for gain in by_filter], errors)
         history.append(raw)
         correlation.append(result)
@@ -76,6 +78,7 @@ def _step(
     n, size = len(network.states), len(raw)
     plant, sensor = (at(item, k) for item in (network.plant, network.sensor))
     c, m = sensor.matrix, len(sensor.matrix)
+    # Motion and transmission: q -> (1, x+, s) -> (y, C s_r, 1).
     move = np.eye(size)  # (1, x, s) -> (1, x+, s)
     move[1 : 1 + n, 0], move[1 : 1 + n, 1 : 1 + n] = plant.noise.mean, plant.matrix
     sends = np.zeros((m * (1 + len(network.relays)) + 1, size))  # (1, x+, s) -> (y, C s_r, 1), less the sensor's noise
@@ -83,6 +86,7 @@ def _step(
     for r in range(len(network.relays)):
         sends[(1 + r) * m : (2 + r) * m, 1 + (1 + r) * n : 1 + (2 + r) * n] = c
     sends[-1, 0] = 1.0
+    # Second moments after the motion and of the sent signals.
     moved = move @ raw @ move.T
     moved[1 : 1 + n, 1 : 1 + n] += plant.noise.covariance
     second = sends @ moved @ sends.T
@@ -94,7 +98,8 @@ def _step(
     for f, (h, gain) in enumerate(zip(received, gains, strict=True)):
         rows, mine = slice(1 + (1 + f) * n, 1 + (2 + f) * n), slice(place, place + len(h.mean))
         place += len(h.mean)
-        values = np.zeros((len(sends), size))  # what would be sent if this estimate were everybody's
+        # Innovation i_f = z_f - E[z_f if every estimate were s_f].
+        values = np.zeros((len(sends), size))  # signals sent if this estimate were everybody's
         values[:m, 0] = c @ plant.noise.mean + sensor.noise.mean
         values[:m, rows] = c @ plant.matrix
         values[m:-1, rows] = np.tile(c, (len(network.relays), 1))
@@ -102,6 +107,7 @@ def _step(
         innovation = np.zeros((len(h.mean), size + update.shape[1]))
         innovation[:, :size], innovation[:, size:][:, mine] = -h.mean @ values, np.eye(len(h.mean))
         innovations.append(innovation)
+        # Correction s_f+ = A s_f + K i_f.
         close[rows, rows] = plant.matrix - gain @ h.mean @ values[:, rows]
         close[rows, 0] = plant.noise.mean - gain @ h.mean @ values[:, 0]
         update[rows, mine] = gain
@@ -143,7 +149,7 @@ def _receive(network: RelayNetwork, name: str, k: int, sent: int) -> _Observatio
 
 
 def _correlation(error: np.ndarray, innovation: np.ndarray, joint: np.ndarray, received: _Observation) -> float:
-    """Largest |E e i'| relative to the root of E e e and E i i; zero for a filter that hears nothing."""
+    """Return the largest |E e i'| relative to the root of E e e and E i i; zero for a filter that receives nothing."""
     if not np.any(received.raw):
         return 0.0
     cross = error @ joint @ innovation.T

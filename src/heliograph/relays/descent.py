@@ -19,15 +19,16 @@ MEMORY = 30  # updates that stand for the inverse Hessian of many variables
 def bfgs(
     function: Function, start: Float[np.ndarray, "n"], iterations: int = 300, tolerance: float = 1e-12
 ) -> Float[np.ndarray, "n"]:
-    """Follow value and gradient down from `start`, where the value is finite; a step to an infinite value is shortened.
+    """Minimise by BFGS from `start`, where the value is finite; a step to an infinite value is shortened.
 
-    Stops after PATIENCE steps that gain less than `tolerance`, or where no step goes down any more.
+    Stops after PATIENCE steps that gain less than `tolerance`, or where no step decreases the value any more.
     """
     x = np.asarray(start, dtype=np.float64)
     value, gradient = function(x)
     inverse = np.eye(len(x)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
     idle = 0
     for iteration in range(iterations):
+        # Quasi-Newton direction; steepest descent where it is no direction of descent.
         direction = -inverse @ gradient
         if direction @ gradient >= 0:
             inverse = np.eye(len(x)) * 1e-2 / np.linalg.norm(gradient)
@@ -35,6 +36,7 @@ def bfgs(
         taken = _backtrack(function, x, value, direction, float(direction @ gradient))
         if taken is None:
             break
+        # BFGS update of the inverse Hessian.
         step, new_value, new_gradient = taken
         inverse = _update(inverse, step, new_gradient - gradient, first=iteration == 0)
         idle = idle + 1 if value - new_value < tolerance else 0
@@ -47,18 +49,20 @@ def bfgs(
 def lbfgs(
     function: Function, start: Float[np.ndarray, "n"], iterations: int, tolerance: float
 ) -> Float[np.ndarray, "n"]:
-    """As `bfgs`, for thousands of variables of like scale: of the inverse Hessian the last MEMORY updates are kept."""
+    """Minimise like `bfgs` thousands of variables of like scale: the last MEMORY updates stand for the inverse Hessian."""
     x = np.asarray(start, dtype=np.float64)
     value, gradient = function(x)
     updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
     idle = 0
     for _ in range(iterations):
+        # Two-loop recursion for the quasi-Newton direction.
         direction = -_inverse_times(updates, gradient)
         taken = _backtrack(function, x, value, direction, float(direction @ gradient))
         if taken is None:
             break
         step, new_value, new_gradient = taken
         change = new_gradient - gradient
+        # Curvature condition s' y > 0.
         if step @ change > 1e-12 * np.linalg.norm(step) * np.linalg.norm(change):
             updates.append((step, change))
         idle = idle + 1 if value - new_value < tolerance else 0

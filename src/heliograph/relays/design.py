@@ -1,4 +1,4 @@
-"""What a design of a relay network gives: gains, exact error covariances, power; and its filters as schedules."""
+"""Designs of relay networks: gains, exact error covariances, power, and the filters as schedules."""
 
 from collections.abc import Mapping
 
@@ -19,11 +19,15 @@ GainsByFilter = Mapping[str, ArrayLike]  # by name, each (steps, n, received)
 
 @readable
 class RelayDesign(Module):
-    """Gains of every filter for each step, computed before any data, and what they give.
+    """Gains of every filter for each step, computed before any data, with exact error covariances and power.
 
-    gains[filter]: zero where the filter hears nothing. covariance[filter]: E (x - s)(x - s)' at k = 0 .. steps, exact.
-    power[relay]: mean square E |C s|^2 of what it sends, zero where nobody listens. moments: covariance of
-    (x, e_1 .. e_F), the receiver's error last. For a periodic design `steps` is the period and entry 0 equals the last.
+    For a periodic design `steps` is the period and entry 0 equals the last.
+
+    Args:
+        gains: filter gains by name (steps, n, received), zero where the filter receives nothing.
+        covariance: E (x - s)(x - s)' by filter at k = 0 .. steps, exact (steps + 1, n, n).
+        power: mean square E |C s|^2 of what each relay sends, zero where nobody listens (steps,).
+        moments: covariance of (x, e_1 .. e_F), the receiver's error last (steps + 1, d, d).
     """
 
     gains: dict[str, Float[np.ndarray, "steps n _"]]
@@ -41,7 +45,7 @@ class RelayDesign(Module):
 
 
 def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
-    """Error covariances and power of any gains, {filter: (steps, n, received)}.
+    """Compute error covariances and power of a `network` under any gains, {filter: (steps, n, received)}.
 
     Raises:
         ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
@@ -106,10 +110,11 @@ def as_design(network: RelayNetwork, result: Propagated) -> RelayDesign:
 
 
 def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Schedule]:
-    """Every filter of a design as a schedule of gains, to save, to simulate or to run: s+ = A s + K (z - B s - b).
+    """Return every filter of a design as a schedule of gains, to save, to simulate or to run.
 
-    B s + b is what the filter would hear in the mean if its own estimate were everybody's. Claim: "exact" for complete
-    data from the network it was designed for.
+    s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
+    "exact"
+    for complete data from the network it was designed for.
 
     Raises:
         ValueError: a design of another network.
@@ -120,6 +125,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     steps = network.steps(len(design.moments) - 1)
     rows, constants = expected_maps(steps)
+    # Moments of (eta+ before correction, innovation): predicted and innovation covariances.
     n, before = len(network.states), np.asarray(_before_correction(steps, design.moments[:-1]))
     d = design.moments.shape[-1]
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
@@ -129,6 +135,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         error = slice((1 + f) * n, (2 + f) * n)
         believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
         gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]
+        # s+ = (A - K B) s + K z + a - K b.
         transition = steps.transition - gain @ expected
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
@@ -144,7 +151,7 @@ def _before_correction(steps: Steps, moments: Float[Array, "time d d"]) -> Float
 
 
 def expected_maps(steps: Steps) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
-    """What each row expects to hear, B s + b, from the estimate s of its filter."""
+    """Return B and b of the prediction B s + b of each received number from the estimate s of its filter."""
     relays = len(steps.received) - 1
     predicted = [steps.sensing @ steps.transition, *[steps.sensing] * relays]
     constant = np.einsum("kmn,kn->km", steps.sensing, steps.drift) + steps.sensor_offset

@@ -10,7 +10,7 @@ _propagate_own = compiled(propagate_own)
 
 
 def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
-    """Gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
+    """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
     K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
     what the receiver can know later (see `receiver_error_design`).

@@ -26,10 +26,10 @@ SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relati
 
 
 def periodic_steps(network: RelayNetwork) -> Steps:
-    """One period, at the stationary mean of the state.
+    """Return the steps of one period, at the stationary mean of the state.
 
     Raises:
-        ValueError: parts that vary beyond the slots, or a plant whose mean does not settle.
+        ValueError: parts that vary beyond the slots, or a plant whose mean does not converge.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     if steps_covered(network) is not None:
@@ -44,10 +44,10 @@ def periodic_steps(network: RelayNetwork) -> Steps:
 
 
 def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
-    """Where `own_error_design` settles: gains and moments over one period, from the first slot on.
+    """Return the steady state of `own_error_design` of a `network`: gains and moments over one period, from the first slot.
 
     Raises:
-        ValueError: what `periodic_steps` refuses, or moments that do not settle.
+        ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
     instance("network", network, RelayNetwork, "a RelayNetwork")
     result, change = _solve_own_steady(periodic_steps(network), start_moments(network))
@@ -57,7 +57,7 @@ def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
 
 
 def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
-    """The steady state under given gains, one entry per slot: {filter: (slots, n, received)}.
+    """Return the steady state of a `network` under given gains, one entry per slot: {filter: (slots, n, received)}.
 
     The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
 
@@ -74,9 +74,11 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
-    """Steady error covariance of the best linear receiver behind given relays, at the end of each slot.
+    """Return the steady error covariance of the best linear receiver behind given relays, at the end of each slot.
 
-    Shapes: gains[relay] (slots, n, received).
+    Args:
+        network: the network, which varies with its slots only.
+        gains: relay gains by name (slots, n, received).
 
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
@@ -122,7 +124,7 @@ def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
-    """Whether all are positive semidefinite to rounding: the fixed point is then the limit."""
+    """Return whether all moments are positive semidefinite to rounding: the fixed point is then the limit."""
     fixed = jax.lax.stop_gradient(moments)
     smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
     return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
@@ -138,6 +140,7 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     side = jax.vmap(relay_side)(steps, moments, gains)
     d = side.transition.shape[-1]
 
+    # Riccati recursion of the receiver, held constant under differentiation.
     def predict(spread: jax.Array, item: RelaySide) -> jax.Array:
         both = jnp.concatenate([item.transition, item.output])
         return both @ spread @ both.T + item.noise
@@ -152,8 +155,10 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     converged = _solve_steady(
         lambda e: jax.lax.scan(best, e, held)[0], jax.lax.stop_gradient(moments[0][:d, :d]), HELD
     )[0]
+    # Best gains over one period, from the converged covariance.
     best_gains = jax.lax.stop_gradient(jax.lax.scan(best, converged, held)[1])
 
+    # Joseph form with these gains: affine in the covariance, so its fixed point is one linear solve.
     def given(spread: jax.Array, item: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         part, gain = item
         close = jnp.concatenate([jnp.eye(d), -gain], axis=1)

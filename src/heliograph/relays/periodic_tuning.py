@@ -33,13 +33,16 @@ Cost = Callable[[Array, Steps, Array, tuple[Array, ...], Array, Array, Array], t
 
 
 def periodic_receiver_error_design(
-    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: ArrayLike | None = None
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
 ) -> RelayDesign:
-    """Gains of relays and receiver that together make the steady sum over the slots of tr P small.
+    """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
-    Descent through the fixed point of the second moments, from `start` {filter: (slots, n, received)}, by default the
-    steady `own_error_design`. The result is a local minimum. `power_limit`, a number or (slots,), bounds the power that
-    all relays send in each slot.
+    Descent through the fixed point of the second moments; the result is a local minimum.
+
+    Args:
+        network: the network, which varies with its slots only.
+        start: gains to begin with, {filter: (slots, n, received)}; the steady `own_error_design` unless given.
+        power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
 
     Raises:
         ValueError: what `periodic_steps` refuses, a start of the wrong shape or under which the moments diverge, a
@@ -52,11 +55,17 @@ def periodic_receiver_error_design(
 
 
 def periodic_relays_for_best_receiver(
-    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: ArrayLike | None = None
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
 ) -> dict[str, Float[np.ndarray, "slots n _"]]:
-    """Relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
+    """Design relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
 
-    As `periodic_receiver_error_design`, but the receiver is `periodic_behind_relays`. Returns {relay: gains}.
+    Args:
+        network: the network, which varies with its slots only.
+        start: relay gains to begin with, {relay: (slots, n, received)}; the steady `own_error_design` unless given.
+        power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
+
+    Returns:
+        Gains by relay (slots, n, received); the receiver is `periodic_behind_relays`.
 
     Raises:
         ValueError: as for `periodic_receiver_error_design`; no relays.
@@ -70,10 +79,11 @@ def periodic_relays_for_best_receiver(
 def _tune(
     network: RelayNetwork, start: Float[np.ndarray, "slots Fn R"], cost: Cost, power_limit: ArrayLike | None
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Descend over the free entries of the gains, each filter's in units of its largest."""
+    """Descend over the free entries of the gains, those of each filter in units of its largest."""
     steps = periodic_steps(network)
     if len(start) != len(network.slots):
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(start))
+    # Free entries: those that multiply a received number.
     used = gain_mask(steps) & (steps.live[:, None, :] > 0)
     if cost is _behind_cost:
         used[:, :, -network.received[-1] :] = False
@@ -103,7 +113,7 @@ def _tune(
 
 
 def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
-    """Whether no slot is above its limit, and those with a multiplier are at it."""
+    """Return whether no slot is above its limit, and those with a multiplier are at it."""
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 

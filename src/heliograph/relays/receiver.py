@@ -19,12 +19,14 @@ from heliograph.relays.second_moments import correct, linear_maps, step_moments
 
 
 def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Schedule:
-    """The linear minimum-mean-square-error filter of x_k from all that the receiver heard up to k.
+    """Return the linear minimum-mean-square-error filter of x_k from everything that the receiver received up to k.
 
-    Its state is an estimate of (x, e_1, ..., e_relays), e_r = x - s_r, which moves linearly; what the random gains add
-    is white, with the covariance that their second moments give. Claim: "exact" for complete data.
+    Its state is an estimate of (x, e_1, ..., e_relays), e_r = x - s_r, which moves linearly; the random gains add white
+    noise, with the covariance that their second moments give. Claim: "exact" for complete data.
 
-    Shapes: gains[relay] (steps, n, received); a receiver's gain among them is not used.
+    Args:
+        network: the relay network.
+        gains: relay gains by name (steps, n, received); a receiver's gain among them is not used.
 
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
@@ -33,10 +35,10 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
-    """Relays with their gains as the receiver has to do with them: a linear system of (x, e_1, ..., e_relays, z).
+    """Return the `network` with given relay `gains` as its receiver sees it: a linear system of (x, e_1, ..., e_relays, z).
 
     z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
-    `receiver_behind_relays` with its covariance carried along: for data with gaps, and for smoothing.
+    `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for smoothing.
 
     Raises:
         ValueError: what `receiver_behind_relays` refuses.
@@ -48,8 +50,10 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     known, received, white = _sides(steps, start_moments(network), joined)
     d, r = known.shape[-1], received.shape[1]
     none = np.zeros((len(known), d + r, r))
+    # Means: x+ has drift a, z the constant b.
     drift = np.zeros((len(known), d + r))
     drift[:, :n], drift[:, d:] = steps.drift, expected_maps(steps)[1][:, -r:]
+    # (x, e, z)+ = [known; received] (x, e) + white noise, measured as z exactly.
     system = SystemSteps(
         transition=np.concatenate([np.concatenate([known, received], axis=1), none], axis=2),
         drift=drift,
@@ -92,10 +96,10 @@ class RelaySide(NamedTuple):
 
 
 def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
-    """What the receiver has to do with in one step."""
+    """Return the linear system of (x, e_relays) that the receiver estimates in one step."""
     n, r = p.transition.shape[-1], p.received[-1]
     maps, d = linear_maps(p), moments.shape[0]
-    known, rows = d - n, p.gain.shape[0] - r  # all but the receiver's error, all but what the receiver hears
+    known, rows = d - n, p.gain.shape[0] - r  # without the receiver's error, without its received rows
     received = (p.gain @ maps.sent)[rows:]
     full = jnp.concatenate([maps.moved[:known], maps.innovation[:rows], received])
     relays = jnp.concatenate([jnp.zeros((n, rows)), -(gain * p.live)[: known - n, :rows]])

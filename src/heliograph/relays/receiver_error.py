@@ -29,23 +29,31 @@ STEPS = 4  # of a descent within a power limit, for each sweep
 def receiver_error_design(
     network: RelayNetwork,
     horizon: int,
-    weights: ArrayLike | None = None,
-    power_limit: ArrayLike | None = None,
+    weights: "Float[ArrayLike, ' horizon'] | None" = None,
+    power_limit: "Float[ArrayLike, '*horizon'] | None" = None,
     sweeps: int = 200,
 ) -> RelayDesign:
-    """Gains of relays and receiver that together make sum_k weight_k tr P_k small, P_k the receiver's error covariance.
+    """Design gains of relays and receiver that together make sum_k weight_k tr P_k small, P_k the receiver's covariance.
 
     The cost is quadratic in the gains of one step while the others stay: tr Lam_k [I -K] Z_k [I -K]', with moments Z
     from the steps before and the gradient Lam of the cost to come. A sweep goes backward and then forward and
     minimises exactly at each step, so the cost never rises; it starts from `own_error_design`. The result is a local
     minimum, so an upper bound on the best.
 
-    `weights` (horizon,), by default those that give the mean of tr P_k / tr P_k(own-error design). `power_limit`, a
-    number or (horizon,): bound on the power that all relays send at each step, in squared units of the sensor, met to
-    1e-6. It can't be less than the power of the mean state, which every unbiased estimate sends. With a limit the gains
-    of all steps move at once, inside a logarithmic barrier that is lowered bit by bit, in four quasi-Newton steps for a
-    sweep; the own-error design stays the result where it meets the limit and is better. A limit changed
-    by 1e-14 to 1e-8 changes the error that is left by 0.1 % over the published example's 100 steps.
+    With a power limit the gains of all steps move at once, inside a logarithmic barrier that is lowered bit by bit, in
+    four quasi-Newton steps for a sweep; the own-error design stays the result where it meets the limit and is better. A
+    limit changed by 1e-14 to 1e-8 changes the remaining error by 0.1 % over the published example's 100 steps.
+
+    Args:
+        network: the relay network.
+        horizon: number of steps.
+        weights: weight_k (horizon,); those that give the mean of tr P_k / tr P_k(own-error design) unless given.
+        power_limit: bound on the power that all relays send at each step, a number or (horizon,), in squared units of
+            the
+            sensor, met to 1e-6; none unless given. It can't be less than the power of the mean state, which every
+            unbiased
+            estimate sends.
+        sweeps: number of sweeps, 200 unless given.
 
     Raises:
         ValueError: weights or limits of the wrong shape, negative weights, no sweeps, a limit that no design meets.

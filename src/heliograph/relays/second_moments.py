@@ -1,7 +1,7 @@
 """Exact second moments of a relay network: one linear system with random coefficients.
 
 With e_f = x - s_f for each filter f, eta = (x, e_1, ..., e_F) and what is sent (y, C s_1, ..., C s_relays), one step is
-  s_f+ = A s_f + K_f i_f,   i_f = heard_f - E[heard_f if every estimate were s_f],   heard = G sent + n,  (G, n) random.
+  s_f+ = A s_f + K_f i_f,   i_f = z_f - E[z_f if every estimate were s_f],   z = G sent + n,  (G, n) random.
 Every i_f is a known linear map of eta and noises plus (G - E G) sent + n - E n, which is uncorrelated with all of them.
 So the moments of (eta+ before corrections, i) follow exactly, and every gain acts on them as a known matrix.
 """
@@ -38,7 +38,7 @@ def initial_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float
 
 
 def linear_maps(p: Steps) -> LinearMaps:
-    """The known part of one step."""
+    """Return the deterministic part of one step."""
     (m, n), filters = p.sensing.shape, len(p.received)
     d = (1 + filters) * n
     unit = jnp.eye(d + n + m)
@@ -49,9 +49,7 @@ def linear_maps(p: Steps) -> LinearMaps:
     sent = jnp.concatenate([(p.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
     own_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
     believed = jnp.stack([jnp.asarray(c) for c in own_sends])
-    expects = jnp.asarray(p.gain) @ believed.reshape(
-        -1, n
-    )  # what each row expects to hear, as a map of its filter's estimate
+    expects = jnp.asarray(p.gain) @ believed.reshape(-1, n)  # prediction of each row, as a map of its filter's estimate
     local = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
     return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - local, sent)
 
@@ -88,7 +86,7 @@ def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Arr
 
 
 def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
-    """Where a gain may differ from zero: each filter uses what it hears itself."""
+    """Return True where a gain may differ from zero: each filter uses what it receives itself."""
     n = p.transition.shape[-1]
     return np.asarray(np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner)
 
@@ -103,7 +101,7 @@ def own_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
     gain, start = jnp.zeros((d - n, received)), 0
     for f, length in enumerate(p.received):
         rows = slice(start, start + length)
-        inner = z[d:, d:][rows, rows] + jnp.diag(1.0 - p.live[rows])  # a filter that hears nothing: solve with 1
+        inner = z[d:, d:][rows, rows] + jnp.diag(1.0 - p.live[rows])  # a filter that receives nothing: solve with 1
         cross = z[(1 + f) * n : (2 + f) * n, d:][:, rows] * p.live[rows]
         gain = gain.at[f * n : (f + 1) * n, rows].set(psd_solve(inner, cross.T).T)
         start += length

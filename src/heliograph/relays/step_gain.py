@@ -17,7 +17,7 @@ def normal_matrix(
 ) -> tuple[Float[jax.Array, "r r"], Float[jax.Array, ""]]:
     """Half the Hessian of tr Lam [I -(0; K)] Z [I -(0; K)]' in the r gains that may be free, damped, and the damping.
 
-    Its entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that hears nothing. `damping` is
+    Its entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that receives nothing. `damping` is
     relative to the mean of the diagonal.
     """
     rows, columns = np.nonzero(gain_mask(p))

@@ -1,4 +1,4 @@
-"""Where every moment can lie when probabilities are uncertain: exact ends from corners, interval arithmetic beyond."""
+"""Intervals of every moment when probabilities are uncertain: exact from corner laws, interval arithmetic beyond."""
 
 import jax
 import numpy as np
@@ -30,9 +30,11 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     """
     check_forgets("channel of a bound", channel)
     corners = _corner_count(channel)
+    # Every entry is multilinear in the uncertain probabilities, so corner laws attain its ends.
     if corners is not None and corners <= CORNERS:
         matrices = channel.corner_moments(order)
         return matrices.min(axis=0), matrices.max(axis=0)
+    # Too many corners: interval products of the parts.
     match channel:
         case Series():
             low, high = moment_interval(channel.maps[0], order)
@@ -81,6 +83,7 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
     tables = [[moment_interval(m, k) if k else None for k in range(order + 1)] for m in channel.maps]
     rows = []
     for powers in exponents(channel.outputs + 1, order):
+        # Row z^a = prod_parts z_part^(a_part) times a power of the constant 1.
         result: Interval = (np.ones(1), np.ones(1))
         degree, start = 0, 0
         for m, table in zip(channel.maps, tables, strict=True):
@@ -93,6 +96,7 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
                     _multiply_rows(result, degree, (part[0][row], part[1][row]), k, variables),
                     degree + k,
                 )
+        # The constant's power is a column of its own.
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0
         rows.append(_multiply_rows(result, degree, (constant, constant), powers[-1], variables))

@@ -1,4 +1,4 @@
-"""Maps between monomials: what a map makes of the powers of its input."""
+"""Lifts of maps to monomials: powers of the output as a linear function of powers of the input."""
 
 import equinox as eqx
 import jax
@@ -20,10 +20,14 @@ from heliograph.random_affine.moments.monomials import (
 
 
 class Lift(AbstractRandomAffine):
-    """The map between monomials: from those of y up to `degree` to those of z; degree 2 is the square.
+    """Lift of a map to monomials: from those of y of degree 1 to `degree` to those of z; degree 2 is the square.
 
     Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of
-    moments is one of several with the same value at every lifted point; the one given divides by the repetitions.
+    moments is one of several with the same value at every lifted point; the one returned divides by the repetitions.
+
+    Args:
+        base: the map; it must not erase.
+        degree: the highest degree.
     """
 
     base: AbstractRandomAffine
@@ -94,7 +98,7 @@ def _products(variables: int, degree: int, order: int) -> np.ndarray:
 
 
 def square(base: AbstractRandomAffine) -> Lift:
-    """The map between all monomials up to degree 2 (the quadratic lift).
+    """Return the lift of `base` to all monomials up to degree 2 (the quadratic lift).
 
     Raises:
         ValueError: when asked for moments whose matrix would need more than the stated memory.

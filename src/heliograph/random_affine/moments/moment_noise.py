@@ -32,7 +32,7 @@ class NoiseMoments(AbstractNoise):
     mean: Vector
     covariance: Square
 
-    def __init__(self, moments: ArrayLike):
+    def __init__(self, moments: "Float[ArrayLike, ' order']"):
         self.moments = array("noise moments", moments, (None,))
         if len(self.moments) < 2:
             raise fail("noise moments", "at least E[n] and E[n^2]", f"{len(self.moments)} of them")
@@ -67,6 +67,7 @@ def check_moments(moments: np.ndarray) -> None:
     size = scale ** np.arange(len(sequence))
     in_range = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
     m = sequence[in_range] / size[in_range]  # unit second moment, so that one tolerance serves all orders
+    # Range condition: h = E[V n^j] lies in the range of H = E[V V'].
     for j in range(1, len(m) // 2 + 1):
         hankel = np.array([[m[a + b] for b in range(j)] for a in range(j)])
         known = np.array([m[a + j] for a in range(j) if a + j < len(m)])
@@ -77,20 +78,23 @@ def check_moments(moments: np.ndarray) -> None:
         if gap > np.sqrt(MOMENT_TOLERANCE) * np.max(np.abs(known), initial=1.0):
             expected = "a law of the atoms that the lower moments imply"
             raise fail("noise moments", expected, f"E[n^{2 * j - 1}] = {moments[2 * j - 2]:.10g}, which no law has")
+        # Schur complement: E[n^2j] >= h' H^-1 h.
         if 2 * j < len(m) and m[2 * j] < known @ solution - MOMENT_TOLERANCE * max(abs(m[2 * j]), 1.0):
             least = float(known @ solution) * scale ** (2 * j)
             raise fail("noise moments", f"E[n^{2 * j}] of at least {least:.10g}, which the lower moments imply",
                        f"{moments[2 * j - 1]:.10g}, which no distribution has")  # fmt: skip
 
 
-def recorded_noise(samples: ArrayLike, order: int) -> FiniteSupport:
-    """The law that gives each recorded sample the same probability: its moments are the sample's.
+def recorded_noise(samples: "Float[ArrayLike, 'samples *components']", order: int) -> FiniteSupport:
+    """Return the empirical law of recorded samples: its moments are the sample's.
 
-    order: the highest moment that will be read (a filter of degree d reads 2 d). Warns where the sample is too small
-    for it: where the standard error of some E[n^a], |a| <= order, exceeds MOMENT_ERROR of its largest possible size
-    prod_i (E|n_i|^|a|)^(a_i / |a|) (Hölder). A sample says nothing of shocks rarer than one in its length.
+    Warns where the sample is too small for `order`: where the standard error of some E[n^a], |a| <= order, exceeds
+    MOMENT_ERROR of its largest possible size prod_i (E|n_i|^|a|)^(a_i / |a|) (Hölder). A sample says nothing of shocks
+    rarer than one in its length.
 
-    Shapes: samples (samples, components) or (samples,).
+    Args:
+        samples: recorded noise (samples, components) or (samples,).
+        order: the highest moment that will be read (a filter of degree d reads 2 d).
 
     Raises:
         ValueError: fewer than two samples, an order below 1, numbers that are not finite.
@@ -108,6 +112,7 @@ def recorded_noise(samples: ArrayLike, order: int) -> FiniteSupport:
     worst, where = 0.0, 1
     for powers in (a for k in range(1, order + 1) for a in exponents(values.shape[1], k)):
         degree = sum(powers)
+        # Standard error of the mean of n^a, and Hölder's bound of its size.
         error = np.std(np.prod(values ** np.array(powers), axis=1)) / np.sqrt(len(values))
         size = np.prod(np.mean(absolute**degree, axis=0) ** (np.array(powers) / degree))
         if size > 0 and error / size > worst:

@@ -42,7 +42,7 @@ class Moments(Module):
 
 @cache
 def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
-    """Where monomials of degree `low` in (z, 1) and (y, 1) stand among those of degree `high`, times powers of 1."""
+    """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
     items = [
         [i for i, powers in enumerate(exponents(size + 1, high)) if powers[-1] >= high - low]
         for size in (outputs, inputs)

@@ -80,7 +80,7 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
 
 @cache
 def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
+    """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
     table = _raise_table(variables, degree)
     divisor = np.array([max(c for c, power in enumerate(powers) if power) for powers in exponents(variables, degree)])
     return divisor, table[np.arange(len(divisor)), divisor]

@@ -115,7 +115,7 @@ def _(noise: Tabulated, order: int) -> Array1:
 
 @cache
 def _lower(dimension: int, order: int, above: int) -> np.ndarray:
-    """Where the monomials of total degree `order` in (n, 1) stand among those of degree `above`."""
+    """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
     places = position(dimension + 1, above)
     return np.array([places[(*p[:-1], p[-1] + above - order)] for p in exponents(dimension + 1, order)])
 
@@ -138,7 +138,7 @@ def _checked(channel: AbstractRandomAffine, order: int, moments: Array1) -> Arra
 
 @cache
 def _one_place(variables: int, degree: int) -> np.ndarray:
-    """For each monomial of degree 2 k, one place (flattened) where it stands in the table of products."""
+    """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)
     places = np.zeros(count(variables, 2 * degree), dtype=np.int64)
     places[table] = np.arange(table.size)

@@ -1,4 +1,4 @@
-"""What a filter needs of a channel: mean gain, and quadratic maps above spread and shift for every possible law."""
+"""Second moments of a channel: mean gain, and quadratic maps that bound spread and shift under every possible law."""
 
 import equinox as eqx
 import jax
@@ -76,7 +76,7 @@ def _or_one(value: jax.Array) -> jax.Array:
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Whether z depends on y through anything but a known gain; a law with traced parameters counts as random."""
+    """Return whether z depends on y through more than a known gain; a law with traced parameters counts as random."""
     if described.uncertain or is_traced(described.spread):
         return described.uncertain or not has_known_gain(channel)
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
@@ -84,7 +84,7 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
 
 
 def has_known_mean(described: SecondOrder) -> bool:
-    """Whether E[G] and E[n] are the same under every possible law, to rounding; with traced parameters nobody knows."""
+    """Return whether E[G] and E[n] are the same under every possible law, to rounding; False for traced parameters."""
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
     size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
@@ -93,7 +93,7 @@ def has_known_mean(described: SecondOrder) -> bool:
 
 
 def has_known_gain(channel: AbstractRandomAffine) -> bool:
-    """Whether z = G y + n with one G that never varies."""
+    """Return whether z = G y + n with a constant G."""
     match channel:
         case GainAndNoise():
             return isinstance(channel.law, Constant)
@@ -104,10 +104,12 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
 
 @cached
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
-    """Worst cases over the polytope of probabilities: exact for a gain common to all components, else dominating.
+    """Return mean and second moments of z = G y + n, bounded over the polytope of uncertain probabilities.
 
-    With one scalar gain g, the largest E_v (g - mu)^2, (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these
-    multilinear (or convex) functions of the probabilities have their maxima.
+    Exact for a gain common to all components, else dominating. With one scalar gain g, the largest E_v (g - mu)^2,
+    (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
+    probabilities
+    have their maxima.
 
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
@@ -117,9 +119,11 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     known = _is_known(channel)
+    # Known law: the moments themselves.
     if known:
         spread, shift, power = _tensors(nominal, mean)
         parts = [QuadraticMap(t, np.zeros(t.shape)) for t in (spread, shift, power)]
+    # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     elif isinstance(channel, Stack):
         parts = _from_stack(channel)
     elif _few_corners(channel):
@@ -197,17 +201,20 @@ def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
 
 
 def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """The tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
+    """Return the tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
     items: Matrix = xp.abs(mean[:, :-1])
+    # Sizes of the entries, for relative tolerances.
     local = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(items, items)
     loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
     reach = xp.sqrt(xp.einsum("iiaa->ia", local))[:, None, :] * loud[:, None]
     size = xp.sum(shape**2)
+    # Least squares for s_v in gains_v = s_v M y y' M'.
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
     residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
+    # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
     unit = xp.sqrt(xp.diagonal(largest))
     unit = _still(xp.where(unit > 0, unit, 1.0))
@@ -216,13 +223,14 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
+    # max_v s_v M y y' M' + N_max.
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
     exact = widened + largest[:, :, None, None] * corner
     return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
 
 
 def _still(value: Matrix) -> Matrix:
-    """What a decision is made on, which has no derivative."""
+    """Stop the gradient of a number on which a decision depends."""
     return jax.lax.stop_gradient(value) if is_traced(value) else value
 
 
@@ -236,6 +244,7 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     reach = []
     for part in channel.maps:
         stop = start + part.outputs
+        # Diagonal block, and the reach |H_i - M_i| of the mean of each part.
         moments = second_order(part)
         low, high = moment_interval(part, 1)
         xp = library(low, high, mean)
@@ -246,6 +255,7 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     apart = (label[:, None] != label[None, :])[:, :, None, None]
     xp = library(mean, reach)
     far, size = xp.concatenate(reach), xp.abs(mean)
+    # Off-diagonal blocks: bounds of |D_i Y Y' D_j'| by the product of reaches.
     cross = symmetric_product(far, far)
     power_cross = _of_signal(symmetric_product(size, far) + symmetric_product(far, size) + cross)
     centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
@@ -264,15 +274,17 @@ def _on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
 
 
 def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
-    """Maps from the range of each moment: raw - H0 m' - m H0' + H0 H0' with intervals for raw and m."""
+    """Bound spread, shift and power from the interval of each moment: raw - H0 m' - m H0' + H0 H0'."""
     low, high = moment_interval(channel, 2)
     xp = library(low, high, mean)
+    # Middle and half width of each moment.
     middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
     half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
     raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
     mean_radius = half.mean[:-1]
     spread, _, power = _tensors(middle, mean)
     reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
+    # Radii add up by the triangle inequality.
     spread_radius = (
         raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
     )
