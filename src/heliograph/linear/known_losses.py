@@ -23,7 +23,7 @@ Parts = Float[np.ndarray, "modes n n"]
 
 
 class KnownLossSystem(NamedTuple):
-    """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i of which the receiver knows the kind s = known[i].
+    """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i; the receiver knows their kind s = known[i].
 
     It receives C_s x + v, Cov(v) = R_i. `chain[i, j]` = P(next mode j | now i), `law` is the modes' law in the long
     run.
@@ -123,7 +123,7 @@ def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
-    """Find gains that make the steady bound on E P small: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
+    """Find gains of a small steady bound on E P: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
 
     The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
     converge; policy iteration improves them. Where the result is not certified, gains A C+ are tried, with which an

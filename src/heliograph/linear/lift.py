@@ -86,7 +86,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 def _lifted_steps(
     routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
-    """Return the system's steps and the rounding of both noises; `varies`: whether the plant does, and what measures it.
+    """Return the system's steps and the rounding of both noises; `varies`: whether plant and measurement do.
 
     Where nothing varies and the moments of the state are steady, all later steps equal the last, to rounding.
     """

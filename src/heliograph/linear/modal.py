@@ -26,7 +26,7 @@ def modal_system(
     horizon: int,
     projection: "Float[ArrayLike, 'q n'] | None" = None,
 ) -> LinearSystem:
-    """Return the system of y 1{mode} for a state y+ = `move`(y), measured as z = `measure`(y+), both random affine maps.
+    """Return the system of y 1{mode} for a state y+ = `move`(y) and z = `measure`(y+), both random affine maps.
 
     A plant that depends on a mode is a `move` with modes; a relay that filters behind a shared fading is a `move` of
     (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. With H_j the move in

@@ -13,7 +13,7 @@ from heliograph.numerics.types import ArrayLike, Float
 
 @readable
 class Steps(NamedTuple):
-    """Steps of a linear system y+ = A y + a + w, z = C y+ + c + v, every array with a leading time axis (one step: none).
+    """Steps of a linear system y+ = A y + a + w, z = C y+ + c + v, with a leading time axis (one step: none).
 
     transition A, drift a, process Cov(w), output C, offset c, noise Cov(v).
     """

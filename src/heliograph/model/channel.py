@@ -10,7 +10,7 @@ from heliograph.model.over_time import OverTime, over_time, unstack
 from heliograph.model.sensor import AbstractSensor, check_sensor
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Mixture, Stack

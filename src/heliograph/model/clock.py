@@ -13,7 +13,7 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Square, Vector
 
 Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it

@@ -9,7 +9,7 @@ from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain

@@ -16,7 +16,7 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import Array, ArrayLike
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import (
     AbstractNoise,
     Gaussian,

@@ -74,7 +74,7 @@ class Modes(AbstractModal):
         return any(m.erases for m in self.maps)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of this mode; for a traced mode, one with its numbers, or a choice among maps of several kinds."""
+        """Return the map of this mode; for a traced mode, one with its numbers, or a choice among kinds of maps."""
         if isinstance(state, int | np.integer):
             return self.maps[state]
         leaves, trees = zip(*(jax.tree.flatten(m) for m in self.maps), strict=True)

@@ -49,7 +49,7 @@ def bfgs(
 def lbfgs(
     function: Function, start: Float[np.ndarray, "n"], iterations: int, tolerance: float
 ) -> Float[np.ndarray, "n"]:
-    """Minimise like `bfgs` thousands of variables of like scale: the last MEMORY updates stand for the inverse Hessian."""
+    """Minimise like `bfgs`, for thousands of variables: the last MEMORY updates stand for the inverse Hessian."""
     x = np.asarray(start, dtype=np.float64)
     value, gradient = function(x)
     updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)

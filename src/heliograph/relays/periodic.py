@@ -44,7 +44,7 @@ def periodic_steps(network: RelayNetwork) -> Steps:
 
 
 def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
-    """Return the steady state of `own_error_design` of a `network`: gains and moments over one period, from the first slot.
+    """Return the steady state of `own_error_design` of a `network`: gains and moments over one period.
 
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.

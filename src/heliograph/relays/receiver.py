@@ -35,7 +35,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
-    """Return the `network` with given relay `gains` as its receiver sees it: a linear system of (x, e_1, ..., e_relays, z).
+    """Return a `network` with given relay `gains` as its receiver sees it: a linear system of (x, e_1, ..., z).
 
     z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
     `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for smoothing.

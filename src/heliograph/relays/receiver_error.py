@@ -33,7 +33,7 @@ def receiver_error_design(
     power_limit: "Float[ArrayLike, '*horizon'] | None" = None,
     sweeps: int = 200,
 ) -> RelayDesign:
-    """Design gains of relays and receiver that together make sum_k weight_k tr P_k small, P_k the receiver's covariance.
+    """Design gains of relays and receiver that make sum_k weight_k tr P_k small, P_k the receiver's covariance.
 
     The cost is quadratic in the gains of one step while the others stay: tr Lam_k [I -K] Z_k [I -K]', with moments Z
     from the steps before and the gradient Lam of the cost to come. A sweep goes backward and then forward and

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.traced import is_traced, plain
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Number, Square, Vector
 
