@@ -5,6 +5,7 @@ import json
 import pickle
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +14,15 @@ from heliograph.numerics.check import fail
 
 S = TypeVar("S")
 Plain = bool | int | float | str
+
+
+class File(str):
+    """The path of a file, empty where there is none: a setting that is shown by its name and known by what it holds."""
+
+    __slots__ = ()
+
+
+NO_FILE = File()
 
 
 def leaves(setting: object, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -60,7 +70,7 @@ def _replaced(part: Any, path: list[str], name: str, text: str, known: list[str]
 def _read(now: object, name: str, text: str) -> object:
     """Text as a value of the kind of the present one."""
     if isinstance(now, str):
-        return text
+        return type(now)(text)
     if isinstance(now, bool):
         if text not in ("true", "false"):
             raise fail(f"--set {name}", "true or false", repr(text))
@@ -110,7 +120,14 @@ def digest(setting: object) -> str | None:
     return hashlib.sha256(b"\0".join(parts)).hexdigest()
 
 
+def content(path: Path) -> bytes:
+    """What tells a file from others: a digest of what it holds, nothing where there is none."""
+    return hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b""
+
+
 def _bytes(value: object) -> bytes:
+    if isinstance(value, File):
+        return repr(value).encode() + content(Path(value))
     if value is None or isinstance(value, Plain):
         return repr(value).encode()
     if isinstance(value, np.ndarray) and value.dtype != object:
@@ -122,6 +139,8 @@ def _shown(value: object) -> str:
     """A value in a table: numbers as they are, of anything else what it is."""
     if value is None:
         return "–"
+    if isinstance(value, File):
+        return Path(value).name or "–"
     if isinstance(value, Plain):
         return f"{value:g}" if isinstance(value, float) else str(value)
     numbers = np.asarray(value) if isinstance(value, tuple | list | np.ndarray) else None

@@ -17,7 +17,7 @@ from heliograph.report.progress import Advance, progress
 from heliograph.report.results import Results, write_results
 from heliograph_studies import markdown
 from heliograph_studies.outcome import summary
-from heliograph_studies.settings import differences, digest, with_values
+from heliograph_studies.settings import content, differences, digest, with_values
 from heliograph_studies.stages import Stages
 from heliograph_studies.statement import Statement
 
@@ -40,6 +40,11 @@ def no_progress(what: str, done: int = 0, total: int = 0) -> None:
     """Of work that has not begun."""
 
 
+def no_files(_: object) -> Sequence[Path]:
+    """Settings alone say what is worked out."""
+    return ()
+
+
 def no_data(_: object, __: Path) -> None:
     """All numbers are in the summary."""
 
@@ -53,7 +58,8 @@ class Study(Generic[Setting, Outcome]):
     how many names these have. figures: from an outcome, by name. page: a Markdown template (see `markdown`) beside the
     function `words`, which gives what it puts in beside the outcome's own fields. publication: its title, else empty.
     statements: what is stated, by name of each list. data: writes what else belongs into the folder. needs: packages of
-    extras beside those of `report`.
+    extras beside those of `report`. files: what is read that no setting names; what is missing is said before any work,
+    and stages that were made of other contents are made again.
     """
 
     name: str
@@ -66,6 +72,7 @@ class Study(Generic[Setting, Outcome]):
     statements: Callable[[Outcome], Judged] = no_statements
     data: Callable[[Outcome, Path], None] = no_data
     needs: Sequence[str] = ()
+    files: Callable[[Setting], Sequence[Path]] = no_files
     page: str = "page.md"
 
     def settings(self, values: Mapping[str, str]) -> Setting:
@@ -88,13 +95,14 @@ class Study(Generic[Setting, Outcome]):
         chosen = self.setting() if setting is None else setting
         for name in self.needs:
             import_module(name)
+        key = self._key(chosen)  # names files that are missing
         if out is None:
             with progress(self.stages) as advance:
                 stages = Stages(self.name, advance)
                 with stages.failing_in_a_line():
                     return self.compute(chosen, stages)
         target, lines = Path(out) / self.name, list[str]()
-        stages = Stages(self.name, no_progress, target.with_name(f"{self.name}.stages"), self._key(chosen))
+        stages = Stages(self.name, no_progress, target.with_name(f"{self.name}.stages"), key)
 
         def work(advance: Advance) -> Outcome:
             stages.advance = advance
@@ -166,13 +174,13 @@ class Study(Generic[Setting, Outcome]):
         return {name: pair for name, pair in changed.items() if name not in REPEATED}
 
     def _key(self, setting: Setting) -> str | None:
-        """What kept stages have to be of: this setting, and the study's and the library's present code."""
-        chosen = digest(setting)
+        """What kept stages have to be of: this setting, what files hold, and the present code of study and library."""
+        read, chosen = b"".join(content(path) for path in self.files(setting)), digest(setting)
         if chosen is None:
             return None
         folder = Path(inspect.getfile(self.compute)).parent
         source = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
-        return f"{chosen} {hashlib.sha256(source).hexdigest()} {heliograph.__version__}"
+        return f"{chosen} {hashlib.sha256(read + source).hexdigest()} {heliograph.__version__}"
 
 
 def findings(page: Page, statements: Judged) -> list[str]:

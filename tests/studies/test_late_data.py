@@ -16,6 +16,7 @@ from heliograph_studies.late_data.packets import Packets, statistics
 from heliograph_studies.late_data.plaza import fates_by_node
 from heliograph_studies.late_data.synthetic import synthetic_packets
 from heliograph_studies.late_data.trace import SLOT, read_trace
+from heliograph_studies.settings import differences
 from heliograph_studies.stages import Stages
 from heliograph_studies.study import no_progress
 
@@ -96,7 +97,19 @@ def test_a_log_too_short_is_told_in_one_line(tmp_path, capsys):
 def test_another_example_takes_no_trace(tmp_path, capsys):
     assert main(["example", "fusion", "--out", str(tmp_path), "--trace", "x"]) == 2
     error = capsys.readouterr().err
-    assert "--set: expected one of runs, steps," in error and "got 'trace'" in error
+    assert error == "heliograph: --trace: expected an example that takes it, got 'fusion'\n"
+
+
+def test_a_log_is_known_by_what_it_holds_and_shown_by_its_name(tmp_path):
+    path = tmp_path / "some.log"
+    path.write_text("one")
+    setting = Setting(trace=path)
+    before = example._key(setting)
+    assert example._key(Setting(trace=str(path))) == before
+    path.write_text("two")
+    assert example._key(setting) != before
+    assert differences(setting, Setting())["trace"] == ("–", "some.log")
+    assert "--set trace=some.log" in example.command(setting) and str(tmp_path) not in example.command(setting)
 
 
 def test_the_synthetic_network_has_the_published_statistics():

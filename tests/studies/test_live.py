@@ -3,6 +3,7 @@
 import asyncio
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,7 @@ from nats.js.errors import NoStreamResponseError
 
 from heliograph.serving.brokers.nats import Nats
 from heliograph.serving.brokers.url import address
-from heliograph_studies.live.compute import Outcome
+from heliograph_studies.live.compute import differences
 from heliograph_studies.live.killed import TOPIC, _finals_read, _reads, _send, killed, left_alone
 from heliograph_studies.live.mower import read_drive
 from heliograph_studies.live.server import Server
@@ -36,8 +37,12 @@ def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
     assert record.kills == 1 and len(alone) > 100 and record.finals == alone
     outputs = [json.loads(line)["time"] for line in alone]
     assert outputs == sorted(outputs)
-    outcome = Outcome(400, 0, 1, 0, alone, alone[1:], {"a": (5, 4), "b": (5, 7)}, 0, *[None] * 4, {}, {})  # type: ignore[arg-type]
-    assert not outcome.identical and outcome.lost == 1 and outcome.counted_twice == 2
+
+
+def test_what_was_lost_and_what_was_counted_twice():
+    alone, after = ({node: SimpleNamespace(used=used) for node, used in (("a", 5), ("b", b))} for b in (5, 7))
+    after["a"].used = 4
+    assert differences(alone, after) == (1, 2)
 
 
 @pytest.mark.real("NATS")

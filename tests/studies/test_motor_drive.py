@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 import heliograph as hg
 from heliograph import cli
 from heliograph.numerics.extras import how_to_install
-from heliograph_studies.motor_drive import compute, drive, example, listeners, machine
+from heliograph_studies import motor_drive
+from heliograph_studies.motor_drive import compute, drive, listeners, machine
 from heliograph_studies.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
 
 needs_simulator = pytest.mark.skipif(
@@ -123,12 +124,12 @@ def test_scores_of_made_up_errors():
     score = compute.score(record, "node", "filter")
     # 10,000 draws: a mean square within 4 standard errors of sqrt(2 / 10,000) = 1.4 %, a root within half of it.
     assert score.rmse["speed"] == pytest.approx(0.05 * RATED[4], rel=0.03)
-    assert score.ratio("flux") == pytest.approx(2.0, rel=0.03)
+    assert score.ratio["flux"] == pytest.approx(2.0, rel=0.03)
     assert score.common["speed"] == pytest.approx(0.36, abs=0.02) and score.common["flux"] == pytest.approx(
         0, abs=0.005
     )
-    assert score.nees[0] == pytest.approx((4 * 0.04**2 + 0.05**2) / 5 / 0.02**2, rel=0.03)
-    assert score.nees[1] < score.nees[0] < score.nees[2]
+    assert score.nees_per_dimension["mean"] == pytest.approx((4 * 0.04**2 + 0.05**2) / 5 / 0.02**2, rel=0.03)
+    assert score.nees_per_dimension["low"] < score.nees_per_dimension["mean"] < score.nees_per_dimension["high"]
 
 
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
@@ -145,14 +146,22 @@ def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
 def test_a_missing_simulator_is_told_before_the_work_starts(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gym_electric_motor", None)
     with pytest.raises(ModuleNotFoundError) as caught:
-        example(tmp_path / "out")
+        motor_drive.run(out=tmp_path / "out")
     assert caught.value.name == "gym_electric_motor" and cli.EXTRAS[caught.value.name] == "motor"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_refuses_one_seed():
-    with pytest.raises(ValueError, match="seeds: expected a whole number of at least 2, got 1"):
-        compute.compute(1)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seeds": 1}, "seeds: expected a whole number of at least 2, got 1"),
+        ({"dead_time": 1.0}, "dead_time: expected seconds, at least 0 and less than a step of 0.0005, got 1.0"),
+        ({"resistance": 0.0}, "resistance: expected a positive number, got 0.0"),
+    ],
+)
+def test_refuses_settings_that_are_none(change, words):
+    with pytest.raises(ValueError, match=words):
+        motor_drive.Setting(**change)
 
 
 @pytest.mark.slow
@@ -194,6 +203,6 @@ def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
     assert record.failures() == []
     scores = {name: compute.score(record, *name.split("/")) for name in ("fused/zero_mean", "relay_1/mean_gain")}
     # Twenty seeds give 0.223 and 4.31 with 2 % between seeds.
-    assert scores["fused/zero_mean"].nees[0] == pytest.approx(0.223, rel=0.15)
-    assert scores["relay_1/mean_gain"].nees[0] == pytest.approx(4.31, rel=0.15)
+    assert scores["fused/zero_mean"].nees_per_dimension["mean"] == pytest.approx(0.223, rel=0.15)
+    assert scores["relay_1/mean_gain"].nees_per_dimension["mean"] == pytest.approx(4.31, rel=0.15)
     assert scores["fused/zero_mean"].common["current"] < 0.2, "the seeds draw different sensors and relays"

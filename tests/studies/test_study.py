@@ -228,12 +228,17 @@ def test_what_cannot_be_drawn_fails_in_a_line_and_keeps_everything(study, tmp_pa
     assert calls == ["first", "second"]
 
 
-@pytest.mark.parametrize("change", ["code", "file"])
-def test_stages_of_other_code_or_broken_ones_are_done_again(study, tmp_path, change):
+@pytest.mark.parametrize("change", ["code", "file", "recording"])
+def test_stages_of_other_code_or_data_or_broken_ones_are_done_again(study, tmp_path, change):
+    recording = tmp_path / "recording.csv"
+    recording.write_text("1,2")
+    study = replace(study, files=lambda setting: [recording])
     with pytest.raises(ValueError):
         study.run(Setting(name="broken"), tmp_path)
     if change == "code":
         (tmp_path / "compute.py").write_text("# repaired")
+    elif change == "recording":
+        recording.write_text("1,3")
     else:
         (path,) = (tmp_path / "number.stages").glob("*.pickle")
         path.write_bytes(path.read_bytes()[:-3])

@@ -6,6 +6,7 @@ point is an object `publication` for `reproduce`, or an object `example` for `ex
 
 import ast
 from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -94,13 +95,34 @@ def run(
             raise fail("method" if kind == "publication" else kind, f"one of {expected}", repr(name))
     target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
     studies = {name: load(known[name]) for name in names}
-    settings = {name: study.settings(values) for name, study in studies.items()}  # all are checked before any work
+    settings = {name: set_of(name, study, values, kind) for name, study in studies.items()}  # all before any work
     import jax
 
     for name, study in studies.items():
         study.run(settings[name], target)
         # One study's programs are no other's: kept, those of all are gigabytes.
         jax.clear_caches()  # type: ignore[no-untyped-call]
+
+
+def set_of(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
+    """A study's settings with other values; an option that it has no setting for is called by its name.
+
+    Raises:
+        ValueError: no such setting, or a value that is none.
+    """
+    from heliograph.numerics.check import fail
+
+    published = study.settings({})
+    for option, value in values.items():
+        if isinstance(value, Option) and is_dataclass(published) and not hasattr(published, option):
+            raise fail(f"--{option}", f"{'an' if kind == 'example' else 'a'} {kind} that takes it", repr(name))
+    return study.settings(values)
+
+
+class Option(str):
+    """A value that was given by an option of its own, not by `--set`."""
+
+    __slots__ = ()
 
 
 def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
@@ -111,11 +133,11 @@ def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
     """
     from heliograph.numerics.check import check_count, check_seed, fail
 
-    values = {}
+    values: dict[str, str] = {}
     # Options of the command, checked as numbers.
     for name, value in options.items():
         if value is not None:
-            values[name] = str(value)
+            values[name] = Option(value)
             if name in ("seed", "runs"):
                 (check_seed if name == "seed" else check_count)(f"--{name}", value)
     # Changes by --set, each name once.

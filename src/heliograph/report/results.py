@@ -70,19 +70,6 @@ def write_results(
     return result
 
 
-def report_results(
-    target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
-) -> None:
-    """Call `write_results`, and print the path of the report.
-
-    Raises:
-        ValueError: a folder that cannot be written, or that holds something else.
-        ModuleNotFoundError: an extra is not installed.
-    """
-    write_results(target, stages, compute, tell, needs)
-    print(f"Report: {target / 'report.html'}")
-
-
 def _write(results: Results, folder: Path) -> None:
     from heliograph.report.figures import png, svg
 

@@ -30,8 +30,8 @@ def calibrate(recording: PlazaRecording) -> Calibration:
 
 def calibrate_ranges(recording: PlazaRecording) -> tuple[float, float]:
     """Scale s and variance of range = s distance + noise: regression through the origin, mean squared residual."""
-    received = ~np.isnan(recording.ranges)
-    distance, measured = recording.distances()[received], recording.ranges[received]
+    arrived = ~np.isnan(recording.ranges)
+    distance, measured = recording.distances()[arrived], recording.ranges[arrived]
     scale = float(distance @ measured / (distance @ distance))
     return scale, float(np.mean((measured - scale * distance) ** 2))
 

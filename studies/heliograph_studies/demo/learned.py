@@ -7,9 +7,6 @@ from functools import partial
 import numpy as np
 
 import heliograph as hg
-from heliograph.learning import Fit, Row
-from heliograph.learning.free_marks import Kind
-from heliograph.report.results import Json
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.recording import PlazaRecording
 from heliograph_studies.demo.scores import Score, score
@@ -22,26 +19,38 @@ RELAY_NOISE = (robot.gain.moment(2) + 1) * robot.HOP_VARIANCE  # of both hops, b
 
 
 @dataclass(frozen=True)
-class Learned:
-    """What was learned from the first `rows` of the ranges, and how good it is on the second half of the drive.
+class Parameter:
+    """An estimate with its 95 % interval, None where there is none; boundary: it ran to the end of its range."""
 
-    drift: what the gyro read over the whole drive beside the true turns, rad/s, which nobody learned from.
+    estimate: float
+    low: float | None
+    high: float | None
+    boundary: bool
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learned from the first `rows` of the ranges, and the error (m) on the second half of the drive.
+
+    gyro_rate_of_truth: what the gyro read over the whole drive beside the true turns, rad/s, which nobody learned from.
     """
 
     rows: int
-    fit: Fit
-    second_half: Score
-    second_half_calibrated: Score
-    rest: float
-    drift: float
+    second_half: float
+    second_half_calibrated: float
+    second_half_nees: float
+    gyro_rate_at_rest: float
+    gyro_rate_of_truth: float
+    parameters: dict[str, Parameter]
 
 
 def direct(drive: robot.Drive) -> hg.Network:
     """The robot whose ranges arrive as they are, with all five constants free."""
-    guess = FIRST_GUESS._asdict()
-    kinds: dict[str, Kind] = {"gyro_rate": "real", "range_scale": "real"}
-    results = {name: hg.free(value, name, kinds.get(name, "positive")) for name, value in guess.items()}
-    return received_by_one(drive, robot.Constants(**results), hg.perfect(len(drive.beacons)))
+    constants = {
+        name: hg.free(value, name, "real" if name in ("gyro_rate", "range_scale") else "positive")
+        for name, value in FIRST_GUESS._asdict().items()
+    }
+    return single(drive, robot.Constants(**constants), hg.perfect(len(drive.beacons)))
 
 
 def relayed(drive: robot.Drive) -> hg.Network:
@@ -54,10 +63,10 @@ def relayed(drive: robot.Drive) -> hg.Network:
         hg.free(FIRST_GUESS.position_walk, "position_walk", "positive"),
         HELD,
     )
-    return received_by_one(drive, constants, hg.parallel([hg.hop(gain, RELAY_NOISE)] * len(drive.beacons)))
+    return single(drive, constants, hg.parallel([hg.hop(gain, RELAY_NOISE)] * len(drive.beacons)))
 
 
-def received_by_one(
+def single(
     drive: robot.Drive, constants: robot.Constants, channel: hg.random_affine.AbstractRandomAffine
 ) -> hg.Network:
     """A network of one filter."""
@@ -66,20 +75,30 @@ def received_by_one(
     return hg.Network(plant, {"robot": hg.Node(sensor, channel, filters)})
 
 
-def learn(recording: PlazaRecording, advance: Callable[[str], None] = lambda what: None) -> Learned:
-    """Fit the direct ranges of the first half, and judge on the second."""
-    advance("learning the constants without the truth")
+def first_half(recording: PlazaRecording) -> hg.learning.Fit:
+    """What the direct ranges of the first half say."""
+    build = partial(direct, robot.DRIVES[recording.name])
+    return fitted(build, recording, recording.ranges, len(recording.time) // 2)
+
+
+def learn(recording: PlazaRecording, fit: hg.learning.Fit | None = None) -> Learned:
+    """Fit the first half, unless the fit is given, and judge on the second."""
     drive, half = robot.DRIVES[recording.name], len(recording.time) // 2
-    outcome = fitted(partial(direct, drive), recording, recording.ranges, half)
-    calibrated = received_by_one(drive, robot.Constants(drive.gyro_rate), hg.perfect(len(drive.beacons)))
-    after, before = (judged(n, recording, recording.ranges, half) for n in (outcome.network, calibrated))
+    fit = fit or first_half(recording)
+    calibrated = single(drive, robot.Constants(drive.gyro_rate), hg.perfect(len(drive.beacons)))
+    after, before = (judged(n, recording, recording.ranges, half) for n in (fit.network, calibrated))
     turned = recording.truth[-1, 2] - recording.start_pose[2]
     _, turn, duration = recording.odometry.sum(axis=0)
-    return Learned(half, outcome, after, before, recording.gyro_rate, float((turn - turned) / duration))
+    return Learned(
+        half, after.position_rmse_m, before.position_rmse_m, after.nees_per_dimension, recording.gyro_rate,
+        float((turn - turned) / duration), parameters(fit),
+    )  # fmt: skip
 
 
-def fitted(build: Callable[[], hg.Network], recording: PlazaRecording, received: np.ndarray, rows: int) -> Fit:
-    """Learn from the first rows of what was heard."""
+def fitted(
+    build: Callable[[], hg.Network], recording: PlazaRecording, received: np.ndarray, rows: int
+) -> hg.learning.Fit:
+    """Learn from the first rows of what was received."""
     return hg.fit(build, {"robot": received[:rows]}, recording.odometry[:rows], starts=STARTS)
 
 
@@ -89,58 +108,10 @@ def judged(network: hg.Network, recording: PlazaRecording, received: np.ndarray,
     return score(record.estimates["robot"]["learned"], recording.truth, first)
 
 
-def said(result: Learned) -> str:
-    """What was found, in words."""
-    row = next(row for row in result.fit.rows() if row.name == "gyro_rate")
-    apart = not row.low <= result.rest <= row.high
-    verdict = (
-        "That is not what it reads at rest, so the rate at rest is wrong while driving"
-        if apart
-        else "That agrees with what it reads at rest"
-    )
-    return (
-        f"While driving the gyro is off by {row.estimate:.2e} rad/s ({row.low:.2e} to {row.high:.2e}). {verdict} "
-        f"({result.rest:.2e}); the true turns, which nobody learned from, say {result.drift:.2e}."
-    )
-
-
-def learned_line(result: Learned) -> str:
-    """One line for the terminal."""
-    local, calibrated = result.second_half.position_rmse_m, result.second_half_calibrated.position_rmse_m
-    return (
-        f"Learned without the truth from the first {result.rows} rows: {local:.3f} m on the second "
-        f"half without a relay, "
-        f"where the calibrated filter has {calibrated:.3f} m. {said(result)}"
-    )
-
-
-def interval(row: Row) -> str:
-    """Of an estimate, as a page has it."""
-    if row.boundary:
-        return f"below {row.high:.2g}"
-    return f"{row.low:.4g} to {row.high:.4g}" if row.identified else "not told"
-
-
-def learned_summary(result: Learned) -> dict[str, Json]:
-    """All numbers."""
-    return {
-        "rows": result.rows,
-        "second_half": result.second_half.position_rmse_m,
-        "second_half_calibrated": result.second_half_calibrated.position_rmse_m,
-        "second_half_nees": result.second_half.nees_per_dimension,
-        "gyro_rate_at_rest": result.rest,
-        "gyro_rate_of_truth": result.drift,
-        "parameters": parameters(result.fit),
-    }
-
-
-def parameters(outcome: Fit) -> dict[str, Json]:
-    """Estimates with their intervals, by name; null where there is none."""
+def parameters(fit: hg.learning.Fit) -> dict[str, Parameter]:
+    """Estimates with their intervals, by name."""
 
     def finite(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
 
-    return {
-        row.name: {"estimate": row.estimate, "low": finite(row.low), "high": finite(row.high), "boundary": row.boundary}
-        for row in outcome.rows()
-    }
+    return {r.name: Parameter(r.estimate, finite(r.low), finite(r.high), r.boundary) for r in fit.rows()}

@@ -45,6 +45,12 @@ class PlazaRecording:
         time, truth, odometry, ranges = (a[:rows] for a in (self.time, self.truth, self.odometry, self.ranges))
         return replace(self, time=time, truth=truth, odometry=odometry, ranges=ranges)
 
+    def place(self, time: np.ndarray) -> np.ndarray:
+        """Where the mower was, (time, 2) in metres, at seconds after the start."""
+        known = np.concatenate([[0.0], self.time - self.start])
+        path = np.concatenate([self.start_pose[None, :2], self.truth[:, :2]])
+        return np.column_stack([np.interp(time, known, path[:, i]) for i in range(2)])
+
     def distances(self) -> np.ndarray:
         """True distance to each beacon, (rows, 4) m."""
         result: np.ndarray = np.linalg.norm(self.truth[:, None, :2] - self.beacons, axis=-1)
@@ -69,6 +75,11 @@ def find_recording(name: str = "plaza2") -> Path:
     if not path.is_file():
         raise fail(f"recording {name}", f"the file Data/{FILES[name]} in the gtsam package", "a gtsam without it")
     return path
+
+
+def plaza2(_: object) -> list[Path]:
+    """The file that a study reads whatever its setting."""
+    return [find_recording()]
 
 
 def read_recording(name: str = "plaza2") -> PlazaRecording:

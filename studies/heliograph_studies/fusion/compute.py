@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies.fusion import machine
+from heliograph_studies.cubature_fusion import setting as machine
 from heliograph_studies.fusion.setting import Part, Setting, described, moving_point, node_parts, received_by
 from heliograph_studies.outcome import Inline, Unlisted
 from heliograph_studies.stages import Stages
@@ -198,8 +198,15 @@ def strong(setting: Setting) -> dict[str, Any]:
     """An induction machine behind strong relays: root mean squared error of each rule, and what it claims."""
     rules = {"ci_equal": hg.fusion.EqualIntersection(), "matrix": RULES["matrix"], "all_reports": RULES["all_reports"]}
     fused = {name: hg.Fusion(LOCAL, rule) for name, rule in rules.items()}
-    net = machine.network(LOCAL, fused, setting.machine_nodes)
-    sums = hg.monte_carlo(net, machine.HORIZON, setting.machine_runs, setting.seed, hg.Statistics())["fused"]
+    # The filters trust that their errors have mean zero; "central" is given what all nodes are.
+    scenario, count = machine.STRONG, range(setting.machine_nodes)
+    filters = [machine.cubature(scenario, i, hg.filters.ZeroMean()) for i in count]
+    nodes = {
+        f"node {i + 1}": hg.Node(machine.sensor(scenario, i), machine.channel(scenario), {LOCAL: filters[i]})
+        for i in count
+    }
+    net = hg.Network(machine.plant(scenario), nodes, {**fused, "central": hg.filters.sequential_filter(filters)})
+    sums = hg.monte_carlo(net, scenario.horizon, setting.machine_runs, setting.seed, hg.Statistics())["fused"]
     traces = {name: np.trace(item.claimed(), axis1=1, axis2=2).mean() for name, item in sums.items()}
     errors: dict[str, Any] = {name: float(item.rmse()[0]) for name, item in sums.items()}
     return {**errors, "claimed": {name: float(np.sqrt(trace)) for name, trace in traces.items()}}

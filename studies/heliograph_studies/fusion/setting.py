@@ -6,7 +6,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph_studies.fusion.machine import OUTPUTS
+from heliograph_studies.cubature_fusion import setting as machine
 
 Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
 
@@ -28,7 +28,7 @@ class Setting:
     tree_nodes: int = 10_000
     degree: int = 10
     machine_runs: int = 256
-    machine_nodes: int = len(OUTPUTS)
+    machine_nodes: int = len(machine.NODES)
     intervals: tuple[int, ...] = (1, 2, 3, 4, 6)
     thresholds: tuple[float, ...] = (0.05, 0.15, 0.4)
     traffic_steps: int = 36  # a multiple of all intervals
@@ -41,8 +41,8 @@ class Setting:
         check_count("degree", self.degree, 2)
         check_count("tree_nodes", self.tree_nodes, self.crossed_nodes)
         check_seed("seed", self.seed)
-        if not 2 <= self.machine_nodes <= len(OUTPUTS):
-            raise fail("machine_nodes", f"a number from 2 to {len(OUTPUTS)}", self.machine_nodes)
+        if not 2 <= self.machine_nodes <= len(machine.NODES):
+            raise fail("machine_nodes", f"a number from 2 to {len(machine.NODES)}", self.machine_nodes)
         for d in self.intervals:
             check_count("intervals", d, 1)
             if self.traffic_steps % d:

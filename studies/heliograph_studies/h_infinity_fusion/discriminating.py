@@ -7,7 +7,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.filters.wrappers.prediction import prediction_of
 from heliograph_studies.h_infinity_fusion import structured
-from heliograph_studies.h_infinity_fusion.example import mean_and_error
+from heliograph_studies.h_infinity_fusion.example import Mean, mean_and_error
 from heliograph_studies.h_infinity_fusion.levels import without_gain
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst, worst_disturbance
 
@@ -15,7 +15,7 @@ NODE = "1"  # whose worst cases are searched
 RUNS = 1_000  # at most: errors here are large and alike
 ENERGIES = (1.0, 160.0, 1000.0)  # where phi is its slope, of order one, and saturated
 SEARCH_DRAWS, JUDGE_DRAWS = 32, 2_000
-Errors = dict[str, tuple[float, float]]  # by filter: mean and standard error
+Errors = dict[str, Mean]  # by filter
 
 
 @dataclass(frozen=True)
@@ -87,30 +87,17 @@ def filters(
 
 def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
     """One whose receivers are not told of losses, and one whose are, with other draws."""
-    blind = {
-        node: hg.Node(structured.sensor(node), structured.channel(), filters(node, designs))
-        for node in structured.OUTPUTS
-    }
-    known = {
-        node: hg.Node(
-            structured.sensor(node),
-            structured.channel(structured.known),
-            {
-                "ekf_told": prediction_of(
-                    hg.extended_filter(
-                        structured.plant(False), structured.sensor(node), structured.channel(structured.lossless)
-                    )
-                )
-            },
-        )
-        for node in structured.OUTPUTS
-    }
-    rule = hg.fusion.WeightedFusion(np.full(len(blind), 1 / len(blind)))
+    believed, lossless, lossy = structured.plant(False), structured.channel(structured.lossless), structured.channel()
+    unaware, informed = {}, {}
+    for node in structured.OUTPUTS:
+        sensor = structured.sensor(node)
+        extended = prediction_of(hg.extended_filter(believed, sensor, lossless))
+        unaware[node] = hg.Node(sensor, lossy, filters(node, designs))
+        informed[node] = hg.Node(sensor, structured.channel(structured.known), {"ekf_told": extended})
+    rule = hg.fusion.WeightedFusion(np.full(len(unaware), 1 / len(unaware)))
     return [
-        hg.Network(
-            structured.plant(), nodes, {name: hg.Fusion(name, rule) for name in next(iter(nodes.values())).filters}
-        )
-        for nodes in (blind, known)
+        hg.Network(structured.plant(), nodes, {name: hg.Fusion(name, rule) for name in nodes[NODE].filters})
+        for nodes in (unaware, informed)
     ]
 
 

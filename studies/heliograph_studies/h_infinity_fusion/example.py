@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class Runs:
         """Norm of the fused error, (run, time)."""
         return np.asarray(np.linalg.norm(self.record.errors("fused", fused_name(name, quantizer)), axis=-1))
 
-    def mean_error(self, name: str, quantizer: str) -> tuple[float, float]:
+    def mean_error(self, name: str, quantizer: str) -> "Mean":
         """Mean norm of the fused error over runs and steps, and its standard error."""
         return mean_and_error(self.errors(name, quantizer).mean(axis=1))
 
@@ -66,12 +67,19 @@ class Runs:
         return np.asarray(self.record.truth[0])
 
 
+class Mean(NamedTuple):
+    """A mean over runs and its standard error."""
+
+    mean: float
+    se: float
+
+
 Designs = Mapping[str, list[hg.h_infinity.HInfinityDesign]]  # by name, one for each node
 
 
-def mean_and_error(values: np.ndarray) -> tuple[float, float]:
+def mean_and_error(values: np.ndarray) -> Mean:
     """Mean of independent values (run,) and its standard error."""
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+    return Mean(float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))))
 
 
 def fused_name(name: str, quantizer: str) -> str:

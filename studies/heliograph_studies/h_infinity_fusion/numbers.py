@@ -41,8 +41,7 @@ def numbers(result: Parts) -> dict[str, Any]:
         },
         "growth": growth_numbers(result),
         "index": {
-            "J1": {name: values for name, values in result.indices.local.items()},
-            "J2": {name: value for name, value in result.indices.fused.items()},
+            "J1": result.indices.local, "J2": result.indices.fused,
         },
         "broken_guarantee": {
             "node": NODES[0], "guaranteed": result.nodes[0].horizon.level, **worst_level(result.broken)
@@ -150,16 +149,8 @@ def second_numbers(second: Discriminating) -> dict[str, Any]:
         "without_structure_or_gain": {NODE: second.without_structure_or_gain},
         "growth": finding_numbers(second.finding),
         "worst": {"node": NODE, **{name: worst_level(worst) for name, worst in second.worst.items()}},
-        **{
-            key: {
-                scenario: {name: {"mean": mean, "se": error} for name, (mean, error) in element.items()}
-                for scenario, element in errors.items()
-            }
-            for key, errors in (
-                ("mean_fused_error", second.errors),
-                (f"mean_error_of_node_{NODE}", second.local_errors),
-            )
-        },
+        "mean_fused_error": second.errors,
+        f"mean_error_of_node_{NODE}": second.local_errors,
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.live.timeline import Timeline
 from heliograph.numerics.check import fail
-from heliograph_studies.demo.recording import PlazaRecording, find_recording, read_recording
+from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.late_data import moving, plaza
 from heliograph_studies.late_data.packets import Packets, Statistics, statistics
 from heliograph_studies.late_data.replay import METHODS, Estimated, every_method, squared_errors
@@ -68,7 +68,6 @@ class Outcome:
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Read the network or make one, and send both plants through it."""
-    find_recording()  # a missing extra is told before the work starts
     packets, odd = stages("reading packets", partial(packets_of, setting))
     name = Path(setting.trace).name if setting.trace else None
     point = through_moving(packets, setting, stages)
@@ -131,11 +130,5 @@ def through_plaza(recording: PlazaRecording, packets: Packets, methods: Collecti
         warnings.simplefilter("ignore", UserWarning)
         _shared = Timeline(plaza.network(), 0.0)  # while one of a network lives, others have its compiled programs
         shown, counts = every_method(plaza.network(), events, plaza.odometry(recording), moments, methods)
-    path = np.concatenate([recording.start_pose[None, :2], recording.truth[:, :2]])
-    known = np.concatenate([[0.0], clock])
-
-    def truth(time: np.ndarray) -> np.ndarray:
-        return np.column_stack([np.interp(time, known, path[:, i]) for i in range(2)])
-
-    errors = {name: squared_errors(estimated, truth(estimated.time)) for name, estimated in shown.items()}
-    return Mower(through([errors], counts, moments, shown, truth(moments)), lost)
+    errors = {name: squared_errors(estimated, recording.place(estimated.time)) for name, estimated in shown.items()}
+    return Mower(through([errors], counts, moments, shown, recording.place(moments)), lost)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph_studies.settings import NO_FILE, File
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class Setting:
     runs: int = 10
     duration: float = 900.0
     network_s: float = 3600.0
-    trace: str = ""
+    trace: File = NO_FILE
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -24,3 +25,4 @@ class Setting:
             if not 1.0 <= getattr(self, name) < float("inf"):
                 raise fail(name, "seconds, one or more", getattr(self, name))
         check_seed("seed", self.seed)
+        object.__setattr__(self, "trace", File(self.trace))  # of a path in any form

@@ -1,23 +1,26 @@
-"""How often intervals cover the truth: recordings in batches, each kept, so that a run can be taken up again."""
+"""How often intervals cover the truth, recordings in batches, and what learning gives on a recorded drive."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
-from typing import TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import heliograph as hg
 from heliograph.learning.recordings_apart import fit_each
-from heliograph_studies.learning.parts import stored
-from heliograph_studies.learning.setting import METHODS, ROWS, Row, learned, square_wave, true_values, world
+from heliograph_studies.demo import robot
+from heliograph_studies.demo.compute import networks, one_trial, relay
+from heliograph_studies.demo.learned import direct, fitted, judged, learn, parameters, relayed
+from heliograph_studies.demo.recording import PlazaRecording, read_recording
+from heliograph_studies.learning.setting import METHODS, ROWS, Row, Setting, learned, square_wave, true_values, world
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
 
-BATCH = 64
-BATCHES = 10  # 640 recordings of each row
+Numbers = dict[str, Any]
 
 
-class Counts(TypedDict):
+class Counts(NamedTuple):
     """Of one batch: recordings, those in which no number ran to a limit, and of these those covered."""
 
     recordings: int
@@ -31,36 +34,59 @@ class Coverage:
 
     recordings: int
     left_out: float
-    covered: Mapping[str, Mapping[str, float]]
+    covered: Unlisted[Mapping[str, Mapping[str, float]]]
 
 
-def compute(parts: Path, seed: int, batches: int, advance: Callable[[str], None]) -> dict[str, Coverage]:
-    """Every row, by its name and form; batches that `parts` holds are read from there."""
-    parts.mkdir(parents=True, exist_ok=True)
-    results: dict[str, list[Counts]] = {}
-    for batch in range(batches):
-        for row in ROWS:
-            key = f"{row.name}.{row.form}"
-            advance(f"{key}: recordings {batch * BATCH + 1} to {(batch + 1) * BATCH}")
-            results.setdefault(key, []).append(
-                stored(parts / f"{key}.{seed}.{batch}.json", partial(counts, row, seed, batch))
-            )
-    return {key: pooled(item) for key, item in results.items()}
+@dataclass(frozen=True)
+class Outcome:
+    """Percentages covered by law, form, method and parameter, how many recordings they are of, and the recorded drive.
+
+    plaza: errors with learned and with calibrated constants. rmse and nees: learned from the whole drive, without the
+    truth, and judged on it; calibrated: with the constants that were measured with the truth. second_half: learned from
+    the first half, judged on the second.
+    """
+
+    nominal: float
+    batch: int
+    coverage: dict[str, dict[str, Mapping[str, Mapping[str, float]]]]
+    recordings: dict[str, dict[str, Coverage]]
+    plaza: dict[str, Numbers]
 
 
-def counts(row: Row, seed: int, batch: int) -> Counts:
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """The recorded drive first, then the table."""
+    drive = plaza(setting, stages)
+    recordings = table(setting, stages)
+    covered = {law: {form: c.covered for form, c in forms.items()} for law, forms in recordings.items()}
+    return Outcome(95.0, setting.batch, covered, recordings, drive)
+
+
+def table(setting: Setting, stages: Stages, rows: tuple[Row, ...] = ROWS) -> dict[str, dict[str, Coverage]]:
+    """Coverage by the name of a row and its form; every batch is a piece that is stored."""
+    total, batches = setting.batches * len(rows), []
+    for batch in range(setting.batches):
+        for i, row in enumerate(rows):
+            work = partial(counts, row, setting, batch)
+            batches.append(stages("recordings of the table", work, batch * len(rows) + i, total))
+    result: dict[str, dict[str, Coverage]] = {}
+    for i, row in enumerate(rows):
+        result.setdefault(row.name, {})[row.form] = pooled(batches[i :: len(rows)])
+    return result
+
+
+def counts(row: Row, setting: Setting, batch: int) -> Counts:
     """One batch of one row, fitted and counted."""
-    u = square_wave(row)
-    record = hg.monte_carlo(world(row), row.steps, BATCH, seed, inputs=u, first_run=batch * BATCH)
+    u, size = square_wave(row), setting.batch
+    record = hg.monte_carlo(world(row), row.steps, size, setting.seed, inputs=u, first_run=batch * size)
     fits = fit_each(builder(row), record.measurements["node"], u, row.form)
-    names = [item.name for item in fits.parameters.every]
+    names = [parameter.name for parameter in fits.parameters.every]
     truth = np.array([true_values(row)[name] for name in names])
     covered: dict[str, dict[str, int]] = {}
     for method in METHODS:
         low, high = fits.intervals(method)
         hits = ((low <= truth) & (truth <= high))[fits.inside].sum(axis=0)
         covered[method] = {name: int(hit) for name, hit in zip(names, hits, strict=True)}
-    return Counts(recordings=BATCH, inside=int(fits.inside.sum()), covered=covered)
+    return Counts(size, int(fits.inside.sum()), covered)
 
 
 @cache
@@ -71,9 +97,42 @@ def builder(row: Row) -> Callable[[], hg.Network]:
 
 def pooled(batches: list[Counts]) -> Coverage:
     """Percentages over all batches."""
-    recordings, inside = sum(b["recordings"] for b in batches), sum(b["inside"] for b in batches)
+    recordings, inside = sum(b.recordings for b in batches), sum(b.inside for b in batches)
     covered = {
-        method: {name: 100 * sum(b["covered"][method][name] for b in batches) / max(inside, 1) for name in batch}
-        for method, batch in batches[0]["covered"].items()
+        method: {name: 100 * sum(b.covered[method][name] for b in batches) / max(inside, 1) for name in names}
+        for method, names in batches[0].covered.items()
     }
     return Coverage(recordings, 1 - inside / recordings, covered)
+
+
+def plaza(setting: Setting, stages: Stages) -> dict[str, Numbers]:
+    """The drive's direct ranges, and relayed ones for several draws of the relay."""
+    recording, count = read_recording(), setting.relays
+    numbers = stages("learning from direct ranges", partial(of_direct, recording))
+    behind = [
+        stages("learning from a relay", partial(of_relayed, recording, seed), seed, count) for seed in range(count)
+    ]
+    return {"direct": numbers, "relayed": {name: [draw[name] for draw in behind] for name in behind[0]}}
+
+
+def of_direct(recording: PlazaRecording) -> Numbers:
+    """Of the ranges as they were recorded."""
+    drive = robot.DRIVES[recording.name]
+    whole = fitted(partial(direct, drive), recording, recording.ranges, len(recording.time))
+    after = judged(whole.network, recording, recording.ranges)
+    before = one_trial(recording, networks(drive, 1.0), 0).scores["perfect_channel"]
+    numbers = _others(after.position_rmse_m, before.position_rmse_m, after.nees_per_dimension, whole)
+    return {**vars(learn(recording)), **numbers, "log_likelihood": whole.best.total}
+
+
+def of_relayed(recording: PlazaRecording, seed: int) -> Numbers:
+    """Of the ranges behind the relay drawn with one seed."""
+    drive, received = robot.DRIVES[recording.name], relay(robot.channel, recording.ranges, seed)
+    fit = fitted(partial(relayed, drive), recording, received, len(received))
+    after = judged(fit.network, recording, received)
+    before = one_trial(recording, networks(drive, 1.0), seed).scores["relay_aware"]
+    return {"seed": seed, **_others(after.position_rmse_m, before.position_rmse_m, after.nees_per_dimension, fit)}
+
+
+def _others(rmse: float, calibrated: float, nees: float, fit: hg.learning.Fit) -> Numbers:
+    return {"rmse": rmse, "calibrated": calibrated, "nees": nees, "parameters": parameters(fit)}

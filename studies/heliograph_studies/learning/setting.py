@@ -1,5 +1,6 @@
 """The example's links: one plant, one sensor heard through a relay and directly, under four laws of the gain."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.learning.intervals import Method
 from heliograph.learning.likelihood.objective import Form
+from heliograph.numerics.check import check_count, check_seed
 
 MEAN, VARIANCE = 0.8, 0.16
 PLANT_NOISE, SENSOR_NOISE, HOP_NOISE, DIRECT_NOISE = 0.2, 0.3, 0.3, 0.2
@@ -27,6 +29,21 @@ LAWS: dict[str, hg.random_affine.AbstractLaw] = {
     "log_normal": hg.LogNormal(np.log(MEAN) - LOG_VARIANCE / 2, np.sqrt(LOG_VARIANCE)),
     "rare": hg.Discrete([MEAN - RARE * RARE_STEP, MEAN + (1 - RARE) * RARE_STEP], [1 - RARE, RARE]),
 }
+
+
+@dataclass(frozen=True)
+class Setting:
+    """batches of `batch` recordings for each row of the table; relays: draws of the recorded drive's relays."""
+
+    batches: int = 10
+    batch: int = 64
+    relays: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("batches", "batch", "relays"):
+            check_count(name, getattr(self, name))
+        check_seed("seed", self.seed)
 
 
 class Row(NamedTuple):

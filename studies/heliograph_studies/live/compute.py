@@ -3,8 +3,8 @@
 import asyncio
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,96 +16,120 @@ from heliograph.serving.plant import Link
 from heliograph.serving.storage.identity import identity
 from heliograph.serving.storage.plant_codec import plant_from
 from heliograph.serving.storage.store import Store
-from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, killed, left_alone
-from heliograph_studies.live.mower import PLANT, network, read_drive
-from heliograph_studies.live.server import Server
+from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, Killed, killed, left_alone
+from heliograph_studies.live.mower import PLANT, Drive, network, read_drive
+from heliograph_studies.live.server import Server, find_server
+from heliograph_studies.live.setting import Setting
 from heliograph_studies.live.speed import in_memory, many_plants, through
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
 
-KILLS = 3
-MESSAGES = 20_000  # for the speed
-STAGES = KILLS + 4
+Links = dict[str, Link]  # by node, what the store says that came from it
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was found. `used`: messages that were, by node, of the service left alone and of the one killed."""
+    """Numbers of messages, whether killing changed anything, and how fast messages are used.
+
+    lost: messages that were used when nothing happened and not when it was killed; counted_twice: the other way round.
+    pictures: the page as a browser drew it, by name.
+    """
 
     messages: int
-    unreceived: int
+    ranges_lost_on_the_way: int
+    too_late: int
     kills: int
-    again: int
-    alone: list[bytes]
-    killed: list[bytes]
-    used: dict[str, tuple[int, int]]
-    late: int
-    time: np.ndarray
-    mean: np.ndarray
-    truth: np.ndarray
-    beacons: np.ndarray
-    speed: dict[str, float]
-    pictures: dict[str, bytes]
+    final_estimates: int
+    final_estimates_identical: bool
+    told_again: int
+    lost: int
+    counted_twice: int
+    steps_per_second: dict[str, int]
+    position_rmse_m: float
+    screenshots: list[str]
+    mean: Unlisted[np.ndarray]
+    truth: Unlisted[np.ndarray]
+    beacons: Unlisted[np.ndarray]
+    pictures: Unlisted[dict[str, bytes]]
 
-    @property
-    def identical(self) -> bool:
-        """Whether both told the same bytes, and as many of them."""
-        return bool(self.alone) and self.alone == self.killed
-
-    @property
-    def lost(self) -> int:
-        """Messages that were used when nothing happened, and not when it was killed."""
-        return sum(max(0, alone - killed) for alone, killed in self.used.values())
-
-    @property
-    def counted_twice(self) -> int:
-        """Messages that were used more often than when nothing happened."""
-        return sum(max(0, killed - alone) for alone, killed in self.used.values())
-
-    @property
-    def rmse(self) -> float:
-        """Of the position, of the final estimates, in metres."""
-        return float(np.sqrt(np.mean(np.sum((self.mean[:, :2] - self.truth) ** 2, axis=1))))
+    def draw(self, folder: Path) -> None:
+        """Write the pictures of the page."""
+        for name, picture in self.pictures.items():
+            (folder / f"{name}.png").write_bytes(picture)
 
 
-def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
-    """Run everything, in a folder that goes with it."""
-    drive = read_drive(seed)
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Run everything, each stage in a folder that goes with it."""
+    find_server()  # what is missing is told before the work starts
+    drive = read_drive(setting.seed)
+    alone, links = stages("left alone", lambda: of_alone(drive))
+    restarted, after = stages("killed and started again", lambda: of_killed(drive, len(alone), setting, stages))
+    speed = stages("how fast", lambda: of_speed(drive, setting))
+    outputs = [json.loads(line) for line in restarted.finals]
+    mean = np.array([output["estimates"]["robot"]["filter"]["mean"] for output in outputs])
+    truth = drive.recording.place(np.array([output["time"] for output in outputs]))
+    lost, twice = differences(links, after)
+    return Outcome(
+        messages=len(drive.lines),
+        ranges_lost_on_the_way=drive.unreceived,
+        too_late=sum(link.late for link in links.values()),
+        kills=restarted.kills,
+        final_estimates=len(restarted.finals),
+        final_estimates_identical=bool(alone) and alone == restarted.finals,
+        told_again=restarted.again,
+        lost=lost,
+        counted_twice=twice,
+        steps_per_second=speed,
+        position_rmse_m=float(np.sqrt(np.mean(np.sum((mean[:, :2] - truth) ** 2, axis=1)))),
+        screenshots=sorted(restarted.pictures),
+        mean=mean,
+        truth=truth,
+        beacons=drive.recording.beacons,
+        pictures=restarted.pictures,
+    )
+
+
+def of_alone(drive: Drive) -> tuple[list[bytes], Links]:
+    """Final estimates of a service that nothing happens to, and what it used."""
     with TemporaryDirectory() as name:
-        folder = Path(name)
-        advance("left alone")
-        alone = left_alone(folder, drive.lines)
-        server = Server(folder)
-        server.start()
-        try:
-            record = asyncio.run(killed(folder, server, drive.lines, len(alone), KILLS, seed, advance))
-            advance("how fast")
-            lanes, options = _lanes(), Options(WINDOW)
-            lines = many_plants(drive.lines, MESSAGES)
-            in_memory(lanes, options, lines[:2000])  # compiles
-            speed = {"jsonlines": in_memory(lanes, options, lines)}
-            for kind in ("mqtt", "nats"):
-                speed[kind] = asyncio.run(through(kind, folder, server, lanes, options, lines))
-        finally:
-            server.kill()
-        item, two = (_links(lanes, options, folder / name) for name in (ALONE, KILLED))
-    outputs = [json.loads(line) for line in record.finals]
-    time = np.array([item["time"] for item in outputs])
-    mean = np.array([item["estimates"]["robot"]["filter"]["mean"] for item in outputs])
-    used = {node: (link.used, two[node].used) for node, link in item.items()}
-    late = sum(link.late for link in item.values())
-    return Outcome(len(drive.lines), drive.unreceived, record.kills, record.again, alone, record.finals, used, late,
-                   time, mean, drive.truth(time), drive.recording.beacons, speed, record.pictures)  # fmt: skip
+        return left_alone(Path(name), drive.lines), links_of(Path(name) / ALONE)
 
 
+def of_killed(drive: Drive, count: int, setting: Setting, stages: Stages) -> tuple[Killed, Links]:
+    """What a service tells that is killed, and what it used."""
+    with TemporaryDirectory() as name, Server(Path(name)) as server:
+        work = killed(Path(name), server, drive.lines, count, setting.kills, setting.seed, stages.progress)
+        return asyncio.run(work), links_of(Path(name) / KILLED)
+
+
+def of_speed(drive: Drive, setting: Setting) -> dict[str, int]:
+    """Steps a second, by where the messages come from."""
+    lanes, options, lines = _lanes(), Options(WINDOW), many_plants(drive.lines, setting.messages)
+    in_memory(lanes, options, lines[:2000])  # compiles
+    speed = {"jsonlines": in_memory(lanes, options, lines)}
+    with TemporaryDirectory() as name, Server(Path(name)) as server:
+        for kind in ("mqtt", "nats"):
+            speed[kind] = asyncio.run(through(kind, Path(name), server, lanes, options, lines))
+    return {name: round(value) for name, value in speed.items()}
+
+
+@cache
 def _lanes() -> Lanes:
     with warnings.catch_warnings():  # the drift over an interval is that over its parts but for the heading's share
         warnings.simplefilter("ignore", UserWarning)
         return Lanes(network())
 
 
-def _links(lanes: Lanes, options: Options, place: Path) -> dict[str, Link]:
+def links_of(place: Path) -> Links:
     """What the store says that came from each node."""
-    fleet = Fleet(lanes, options)
+    fleet = Fleet(_lanes(), Options(WINDOW))
     store = Store(str(place), identity(fleet))
     plant = plant_from(PLANT, store.load([PLANT])[PLANT].body, fleet)
     store.close()
     return plant.links
+
+
+def differences(alone: Links, killed: Links) -> tuple[int, int]:
+    """Messages that were used by a service left alone and not by the one killed, and those used more often."""
+    pairs = [(link.used, killed[node].used) for node, link in alone.items()]
+    return sum(max(0, a - b) for a, b in pairs), sum(max(0, b - a) for a, b in pairs)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import re
 import signal
 import subprocess
@@ -10,13 +11,14 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from shutil import which
+from tempfile import TemporaryDirectory
 
 import nats
 import numpy as np
 from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
-from heliograph_studies.live.browser import Screenshots, screenshots
 from heliograph_studies.live.mower import PLANT, SERVED
 from heliograph_studies.live.server import Server, free_port
 
@@ -26,6 +28,9 @@ SOON = 0.3  # s, within which it is killed once it has told enough
 PATIENCE = 240.0  # s, for a service that starts and compiles on a busy machine
 TOGETHER = 20  # messages that are sent before others may work
 ALONE, KILLED = "alone.sqlite", "killed.sqlite"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SIZES = {"page": (1200, 1250), "page_phone": (420, 1700)}  # pixels
+Screenshots = dict[str, bytes]  # PNG files by name
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,23 @@ def finals(bodies: Iterable[bytes]) -> list[bytes]:
     return list(results.values())
 
 
+def screenshots(url: str) -> Screenshots:
+    """A page as on a desk and as on a phone; nothing without a browser."""
+    browser = next(filter(None, map(which, BROWSERS)), None)
+    return {} if browser is None else {name: _screenshot(browser, url, *size) for name, size in SIZES.items()}
+
+
+def _screenshot(browser: str, url: str, width: int, height: int) -> bytes:
+    with TemporaryDirectory() as folder:
+        target = Path(folder) / "page.png"
+        command = [browser, "--headless=new", "--disable-gpu", "--hide-scrollbars", "--timeout=4000"]
+        command += [f"--user-data-dir={folder}", f"--window-size={width},{height}", f"--screenshot={target}", url]
+        if os.geteuid() == 0:  # its sandbox refuses root
+            command.insert(1, "--no-sandbox")
+        subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=120, check=True)
+        return target.read_bytes()
+
+
 async def killed(
     folder: Path,
     server: Server,
@@ -67,7 +89,7 @@ async def killed(
     count: int,
     kills: int,
     seed: int,
-    advance: Callable[[str], None] = lambda what: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     look: Callable[[str], Screenshots] = screenshots,
 ) -> Killed:
     """The same through the broker; the service is killed with -9 after about equal shares of `count` estimates."""
@@ -79,7 +101,7 @@ async def killed(
         run.start()
         await run.until(partial(_reads, client))
         for kill in range(kills):
-            advance(f"killing it, {kill + 1} of {kills}")
+            progress(kill, kills)
             part = slice(len(lines) * kill // (kills + 1), len(lines) * (kill + 1) // (kills + 1))
             async with asyncio.TaskGroup() as group:  # if sending fails nothing more is waited for
                 group.create_task(_send(client, lines[part]))
@@ -87,7 +109,7 @@ async def killed(
                 await asyncio.sleep(generator.uniform(0, SOON))
                 run.kill()
             run.start()
-        advance("what is left")
+        progress(kills, kills)
         await _send(client, lines[len(lines) * kills // (kills + 1) :])
         await run.until(partial(_finals_read, client, count))
         await run.until(partial(_idle, client))

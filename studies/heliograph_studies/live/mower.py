@@ -25,13 +25,6 @@ class Drive:
     lines: list[bytes]
     unreceived: int
 
-    def truth(self, time: np.ndarray) -> np.ndarray:
-        """Where the mower was, (time, 2) in metres."""
-        recording = self.recording
-        known = np.concatenate([[0.0], recording.time - recording.start])
-        path = np.concatenate([recording.start_pose[None, :2], recording.truth[:, :2]])
-        return np.column_stack([np.interp(time, known, path[:, i]) for i in range(2)])
-
 
 def network() -> hg.Network:
     """The robot's own filter; `heliograph serve heliograph_studies.live.mower:network` keeps it running."""

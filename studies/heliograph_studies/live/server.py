@@ -51,6 +51,13 @@ class Server:
         for port in (self.nats, self.mqtt):
             _wait(port)
 
+    def __enter__(self) -> "Server":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
     def kill(self) -> None:
         """End it at once."""
         if self.process is not None:

@@ -1,25 +1,46 @@
 """What the example computes: in every case of truth and model, each filter's errors and claims over the seeds."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import numpy as np
 from scipy import stats
 
 import heliograph as hg
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import compiled
 from heliograph_studies.motor_drive.drive import Drive, simulate_drive
 from heliograph_studies.motor_drive.listeners import network, received
-from heliograph_studies.motor_drive.machine import RATED, ROTOR_RESISTANCE, Machine, draw_truth, euler, plant
+from heliograph_studies.motor_drive.machine import RATED, ROTOR_RESISTANCE, STEP, Machine, draw_truth, euler, plant
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
 
-SEEDS = 20
-DEAD_TIME = 2e-6  # s, of the inverter
-WRONG_RESISTANCE = 1.2 * ROTOR_RESISTANCE
 TRUSTS = {"stated": 1.0, "tenth": 10.0}  # process noise as stated, and a tenth of its deviations
 QUANTITIES = {"current": slice(0, 2), "flux": slice(2, 4), "speed": slice(4, 5)}
 UNITS = {"current": float(RATED[0]), "flux": float(RATED[2]), "speed": float(RATED[4])}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """`seeds` of sensors and relays, the first with `seed`; what departs from the filters' model in some of the cases.
+
+    dead_time of the inverter in seconds; resistance: the filters' rotor resistance over the machine's.
+    """
+
+    seeds: int = 20
+    dead_time: float = 2e-6
+    resistance: float = 1.2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("seeds", self.seeds, 2)
+        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + self.seeds - 1)
+        if not 0 <= self.dead_time < STEP:
+            raise fail("dead_time", f"seconds, at least 0 and less than a step of {STEP:g}", self.dead_time)
+        if not 0 < self.resistance < np.inf:
+            raise fail("resistance", "a positive number", self.resistance)
 
 
 @dataclass(frozen=True)
@@ -37,35 +58,39 @@ class Score:
     """One filter in one case: for each quantity in SI units, actual and claimed root mean square, and their ratio.
 
     common: share of the squared error that is the same for all seeds (of the sensors and channels), hence the model's;
-    without bias for the number of seeds. nees: (NEES per dimension, its 95 % interval), 1 if the claim is exact.
-    actual_over_time and claimed_over_time (time,) by quantity; nees_over_time (time,), per dimension.
+    without bias for the number of seeds. nees_per_dimension: mean and 95 % interval, 1 if the claim is exact.
+    claimed_over_time (time,) by quantity; nees_over_time (time,), per dimension.
     """
 
     rmse: dict[str, float]
     claimed: dict[str, float]
+    ratio: dict[str, float]
     common: dict[str, float]
-    nees: tuple[float, float, float]
-    actual_over_time: dict[str, np.ndarray]
-    claimed_over_time: dict[str, np.ndarray]
-    nees_over_time: np.ndarray
+    nees_per_dimension: dict[str, float]
+    claimed_over_time: Unlisted[dict[str, np.ndarray]]
+    nees_over_time: Unlisted[np.ndarray]
 
-    def ratio(self, quantity: str) -> float:
-        """Actual over claimed; above 1 is too sure."""
-        return self.rmse[quantity] / self.claimed[quantity]
+
+Scores = dict[str, Score]  # by filter, "node/filter"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Scores by trust, case and filter ("node/filter"); the drive of the case "load" and its first seed's means.
+    """Scores by trust, case and filter; the drive of the case "load" and its first seed's means.
 
-    shown: (time, 5) in SI units by trust and filter. failures: what `Record.failures` says, by trust and case.
+    rated: values in SI units. failures: what `Record.failures` says, by trust and case. shown: (time, 5) in SI units by
+    trust and filter.
     """
 
     seeds: int
-    drive: Drive
-    scores: dict[str, dict[str, dict[str, Score]]]
-    shown: dict[str, dict[str, np.ndarray]]
+    steps: int
+    dead_time: float
+    rated: dict[str, float]
+    cases: dict[str, str]
     failures: list[str]
+    scores: dict[str, dict[str, Scores]]
+    drive: Unlisted[Drive]
+    shown: Unlisted[dict[str, dict[str, np.ndarray]]]
 
 
 CASES = {
@@ -79,15 +104,18 @@ CASES = {
     "load_as_state": "load; the filters estimate its torque as a sixth state",
 }
 
-STAGES = len(TRUSTS) * len(CASES)
+
+def drives(setting: Setting) -> tuple[Drive, Drive, Drive]:
+    """Without load, loaded, and loaded behind an inverter with a dead time."""
+    return simulate_drive(loaded=False), simulate_drive(), simulate_drive(dead_time=setting.dead_time)
 
 
-def cases(trust: float, seeds: range) -> list[Case]:
+def cases(simulated: Sequence[Drive], setting: Setting, trust: float) -> list[Case]:
     """One departure at a time, then all that can occur together, then a cure for the greatest."""
-    free, loaded, dead = simulate_drive(loaded=False), simulate_drive(), simulate_drive(dead_time=DEAD_TIME)
-    right, wrong = plant(Machine(), trust=trust), plant(Machine(WRONG_RESISTANCE), trust=trust)
-    local = [np.asarray(_draw_truth(right, loaded.voltages, seed)) for seed in seeds]
-    results = [Case("own_model", loaded.voltages, local, right)]
+    free, loaded, dead = simulated
+    right, wrong = (plant(Machine(r), trust=trust) for r in (ROTOR_RESISTANCE, setting.resistance * ROTOR_RESISTANCE))
+    drawn = [np.asarray(_draw_truth(right, loaded.voltages, seed)) for seed in seeds_of(setting)]
+    result = [Case("own_model", loaded.voltages, drawn, right)]
     for name, drive, model in (
         ("no_load", free, right),
         ("load", loaded, right),
@@ -98,8 +126,13 @@ def cases(trust: float, seeds: range) -> list[Case]:
         ("load_as_state", loaded, plant(Machine(), load_is_state=True, trust=trust)),
     ):
         truth = drive.truth[:, : len(model.states)]
-        results.append(Case(name, drive.voltages, [truth] * len(seeds), model))
-    return results
+        result.append(Case(name, drive.voltages, [truth] * setting.seeds, model))
+    return result
+
+
+def seeds_of(setting: Setting) -> range:
+    """All seeds."""
+    return range(setting.seed, setting.seed + setting.seeds)
 
 
 @compiled
@@ -123,48 +156,53 @@ def score(record: hg.Record, node: str, name: str) -> Score:
     mean_square, claim = np.mean(errors**2, axis=0), np.diagonal(bound.mean(axis=0), axis1=1, axis2=2)
     bias = errors.mean(axis=0) ** 2 - errors.var(axis=0, ddof=1) / seeds
     nees = np.einsum("kti,kti->kt", errors, np.linalg.solve(bound, errors[..., None])[..., 0]) / n
-    actual_over_time, claimed_over_time, common = {}, {}, {}
+    rmse, claimed, common, claimed_over_time = {}, {}, {}, {}
     for quantity, part in QUANTITIES.items():
-        actual_over_time[quantity] = UNITS[quantity] * np.sqrt(mean_square[:, part].sum(axis=1))
+        rmse[quantity] = _root_mean_square(UNITS[quantity] * np.sqrt(mean_square[:, part].sum(axis=1)))
         claimed_over_time[quantity] = UNITS[quantity] * np.sqrt(claim[:, part].sum(axis=1))
+        claimed[quantity] = _root_mean_square(claimed_over_time[quantity])
         common[quantity] = float(bias[:, part].sum() / mean_square[:, part].sum())
-    return Score(
-        rmse={q: float(np.sqrt(np.mean(v**2))) for q, v in actual_over_time.items()},
-        claimed={q: float(np.sqrt(np.mean(v**2))) for q, v in claimed_over_time.items()},
-        common=common,
-        nees=_mean_and_interval(nees.mean(axis=1)),
-        actual_over_time=actual_over_time,
-        claimed_over_time=claimed_over_time,
-        nees_over_time=nees.mean(axis=0),
-    )
+    ratio = {quantity: rmse[quantity] / claimed[quantity] for quantity in QUANTITIES}
+    mean = _mean_and_interval(nees.mean(axis=1))
+    return Score(rmse, claimed, ratio, common, mean, claimed_over_time, nees.mean(axis=0))
 
 
-def _mean_and_interval(values: np.ndarray) -> tuple[float, float, float]:
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _mean_and_interval(values: np.ndarray) -> dict[str, float]:
     """Mean of independent values and its 95 % interval by Student's law."""
     mean, seeds = float(values.mean()), len(values)
     width = float(stats.t.ppf(0.975, seeds - 1) * values.std(ddof=1) / np.sqrt(seeds))
-    return mean, mean - width, mean + width
+    return {"mean": mean, "low": mean - width, "high": mean + width}
 
 
-def compute(count: int, seed: int = 0, advance: Callable[[str], None] = lambda what: None) -> Outcome:
-    """Run all cases at both levels of trust with `count` seeds from `seed` on; `advance` is told what begins.
-
-    Raises:
-        ValueError: fewer than 2 seeds.
-        ModuleNotFoundError: the extra `motor` is not installed.
-    """
-    check_count("seeds", count, 2)
-    scores: dict[str, dict[str, dict[str, Score]]] = {}
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """All cases at both levels of trust."""
+    simulated = stages("the simulator", partial(drives, setting))
+    scores: dict[str, dict[str, Scores]] = {}
     shown: dict[str, dict[str, np.ndarray]] = {}
-    failures, seeds = [], range(seed, seed + count)
+    failures: list[str] = []
     for level, trust in TRUSTS.items():
         scores[level] = {}
-        for case in cases(trust, seeds):
-            advance(f"process noise {level}: {CASES[case.name]}")
-            record = run_case(case, seeds)
-            failures += [f"{level}, {case.name}: {line}" for line in record.failures()]
-            names = [(node, name) for node, filters in record.estimates.items() for name in filters]
-            scores[level][case.name] = {f"{node}/{name}": score(record, node, name) for node, name in names}
+        for done, case in enumerate(cases(simulated, setting, trust)):
+            work = partial(judged, case, seeds_of(setting))
+            scores[level][case.name], failed, means = stages(f"process noise {level}", work, done, len(CASES))
+            failures += [f"{level}, {case.name}: {line}" for line in failed]
             if case.name == "load":
-                shown[level] = {f"{n}/{f}": np.asarray(record.estimates[n][f].mean[0]) * RATED[:5] for n, f in names}
-    return Outcome(count, simulate_drive(), scores, shown, failures)
+                shown[level] = means
+    drive = simulated[1]
+    return Outcome(
+        setting.seeds, len(drive.time), setting.dead_time, UNITS, CASES, failures, scores, drive, shown
+    )  # fmt: skip
+
+
+def judged(case: Case, seeds: range) -> tuple[Scores, list[str], dict[str, np.ndarray]]:
+    """Scores of a case, what failed, and the first seed's means in SI units."""
+    record = run_case(case, seeds)
+    names = [(node, name) for node, filters in record.estimates.items() for name in filters]
+    scores = {f"{node}/{name}": score(record, node, name) for node, name in names}
+    rated = RATED[: len(case.model.states)]
+    means = {f"{n}/{f}": np.asarray(record.estimates[n][f].mean[0]) * rated for n, f in names}
+    return scores, list(record.failures()), means

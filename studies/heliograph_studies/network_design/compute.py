@@ -10,10 +10,9 @@ import heliograph as hg
 from heliograph.planning.comparisons import Front
 from heliograph.planning.paths.model import path_information
 from heliograph_studies.demo import robot
+from heliograph_studies.demo.compute import Design, designs, one_trial
 from heliograph_studies.demo.compute import networks as demo_networks
-from heliograph_studies.demo.compute import one_trial
-from heliograph_studies.demo.recording import find_recording, read_recording
-from heliograph_studies.demo.twin import as_it_is, twins
+from heliograph_studies.demo.recording import read_recording
 from heliograph_studies.network_design import setting as models
 from heliograph_studies.network_design import theory
 from heliograph_studies.network_design.published import Circuit, circuit, packets
@@ -42,7 +41,7 @@ class Outcome:
     one_hop: dict[float, Case]
     two_hops: dict[float, Case]
     front: Front
-    demonstration: dict[str, dict[str, float]]
+    demonstration: dict[str, Design]
     circuit: Circuit
     packets: dict[float, dict[str, float]]
     schedules: Schedules
@@ -51,7 +50,6 @@ class Outcome:
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Everything."""
-    find_recording()  # what is missing is said before the work starts
 
     def cases(name: str, relayed: bool, totals: tuple[float, ...]) -> dict[float, Case]:
         return {p: stages(name, partial(case, relayed, p), done, len(totals)) for done, p in enumerate(totals)}
@@ -93,15 +91,14 @@ def front(setting: Setting, stages: Stages) -> Front:
     )
 
 
-def demonstration(setting: Setting, stages: Stages) -> dict[str, dict[str, float]]:
+def demonstration(setting: Setting, stages: Stages) -> dict[str, Design]:
     """The demonstration's relays as they are, and less the ranges at the start: means over the seeds."""
     recording, seeds = read_recording(), range(setting.seed, setting.seed + setting.seeds)
     network, plain = demo_networks(robot.DRIVES[recording.name], 1.0), []
     for done, seed in enumerate(seeds):
         stages.progress(done, len(seeds))
         plain.append(one_trial(recording, network, seed).scores["relay_aware"])
-    designs = {"as_it_is": as_it_is(recording, plain), **twins(recording, seeds)}
-    return {name: {"rmse": d.rmse, "claimed": d.claimed, "power": d.power} for name, d in designs.items()}
+    return designs(recording, plain, seeds)
 
 
 def schedules(setting: Setting) -> Schedules:

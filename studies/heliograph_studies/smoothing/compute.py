@@ -11,6 +11,7 @@ from heliograph_studies.outcome import Unlisted
 from heliograph_studies.smoothing import setting as models
 from heliograph_studies.smoothing.setting import Setting
 from heliograph_studies.stages import Stages
+from heliograph_studies.successive_relays import setting as successive_relays
 
 SHOWN = (10, 50, 90)
 LAGS, LAG_STEP = (1, 5, 10, 20), 50
@@ -69,7 +70,7 @@ def over_time(covariance: np.ndarray) -> dict[Any, float]:
 
 def relay_traces() -> dict[int, dict[str, float]]:
     """tr Cov(x_k | z_1 ... z_{k + lag}) at an even and an odd step of the receiver that has settled."""
-    network = models.relays_in_turn()
+    network = successive_relays.Setting().network()
     gains = hg.relays.own_error_design(network, models.STEADY).gains
     receiver = hg.filters.LinearSystemFilter(hg.relays.receiver_system(network, gains))
     _, steps = hg.smoothing.smoother_steps(receiver, np.zeros((models.STEADY, 1)))

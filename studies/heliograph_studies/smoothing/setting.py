@@ -1,4 +1,4 @@
-"""Three settings: a moving point behind two fading hops, two relays that take turns, a swinging pendulum."""
+"""Two plants: a moving point behind two fading hops, and a swinging pendulum."""
 
 from dataclasses import dataclass
 
@@ -44,27 +44,6 @@ def moving_point() -> tuple[hg.LinearPlant, hg.LinearSensor, hg.random_affine.Ab
         hg.hop(hg.Rayleigh(0.8), 0.01, amplification=1.2, dimension=2),
     ]
     return plant, sensor, hg.amplify_and_forward(hops)
-
-
-def relays_in_turn() -> hg.model.RelayNetwork:
-    """A circuit heard through two relays that filter and forward, one listening while the other talks."""
-    variance, drive = 4e-6, np.array([[0.6], [0.5], [0.3]])
-    plant = hg.LinearPlant(
-        [[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]],
-        variance * drive @ drive.T,
-        [0.3, 0.2, -0.2],
-        np.diag([0.05, 0.02, 0.03]),
-        states=["capacitor_1", "capacitor_2", "inductor"],
-    )
-    sensor = hg.LinearSensor([[2.0, 1.8, 2.5]], 0.36 * variance)
-
-    def link(mean: float, noise: float = variance) -> hg.random_affine.GainAndNoise:
-        squared = np.log(1 + 0.01 / mean**2)  # a log-normal gain of variance 0.01
-        return hg.hop(hg.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
-
-    odd = {"relay_2": {"sensor": link(0.92), "relay_1": link(0.9, 0.0)}, "receiver": {"relay_1": link(0.9)}}
-    even = {"relay_1": {"sensor": link(0.9), "relay_2": link(0.9, 0.0)}, "receiver": {"relay_2": link(0.92)}}
-    return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), (odd, even))
 
 
 def swing(x: jax.Array, u: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +13,16 @@ from heliograph.files.recording import read_recording as read_measurements
 from heliograph.learning import describe
 from heliograph.learning.likelihood import surface
 from heliograph.model.estimate import Estimate
+from heliograph_studies import demo
 from heliograph_studies.demo import compute as compute_module
-from heliograph_studies.demo import robot, run
-from heliograph_studies.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay
-from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, learn, received_by_one, relayed, said
+from heliograph_studies.demo import robot
+from heliograph_studies.demo.compute import NAMES, Design, Outcome, average_noise, channel_less, relay
+from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, first_half, learn, relayed, single
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.demo.scores import score
-from heliograph_studies.demo.twin import Design, channel_less
+from heliograph_studies.markdown import filled
+from heliograph_studies.stages import Stages
+from heliograph_studies.study import no_progress
 from tests.oracles.range_only import cubature_oracle
 from tests.widths import Widths
 
@@ -34,27 +38,33 @@ def recording() -> PlazaRecording:
 
 
 @pytest.fixture(scope="module")
-def outcome(recording: PlazaRecording) -> Outcome:
-    return compute(recording, 0)
-
-
-@pytest.fixture(scope="module")
-def learned(recording: PlazaRecording) -> Iterator[Learned]:
+def fit(recording: PlazaRecording) -> Iterator[hg.learning.Fit]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "LANES", 1)  # the climb has one start: the others would stand by
-        yield learn(recording)
+        yield first_half(recording)
 
 
 @pytest.fixture(scope="module")
-def folder(
-    outcome: Outcome, designs: dict[str, Design], learned: Learned, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    out = tmp_path_factory.mktemp("run") / "new" / "out"
+def learned(recording: PlazaRecording, fit: hg.learning.Fit) -> Learned:
+    return learn(recording, fit)
+
+
+@pytest.fixture(scope="module")
+def outcome(learned: Learned) -> Outcome:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "compute", lambda *_: outcome)  # computed once for all tests
-        patch.setattr(run, "designs", lambda *_: designs)
-        patch.setattr(run, "learn", lambda *_: learned)
-        run.example(out)
+        patch.setattr(compute_module, "learn", lambda _: learned)  # learned once for all tests
+        return demo.run()
+
+
+@pytest.fixture(scope="module")
+def designs(outcome: Outcome) -> dict[str, Design]:
+    return outcome.designs
+
+
+@pytest.fixture(scope="module")
+def folder(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "new" / "out"
+    replace(demo.example, compute=lambda *_: outcome).run(demo.Setting(), out)  # computed once for all tests
     assert [p.name for p in out.iterdir()] == ["demo"]  # nothing temporary is left beside it
     return out / "demo"
 
@@ -74,17 +84,12 @@ RELAY_NOISE = (SECOND + 1) * robot.HOP_VARIANCE
 def test_filters_are_the_textbook_ones(
     recording: PlazaRecording, outcome: Outcome, name: str, gain_variance: float, noise: float
 ) -> None:
-    trial = outcome.trials[0]
+    trial = outcome.shown
     received = recording.ranges if name == "perfect_channel" else trial.received
     mean, covariance = cubature_oracle(recording, received, gain_variance, noise)
     # Rounding only; errors of 1e-16 grow over 1816 steps of a stable filter by little.
     np.testing.assert_allclose(trial.estimates[name].mean, mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(trial.estimates[name].covariance, covariance, rtol=0, atol=1e-9)
-
-
-@pytest.fixture(scope="module")
-def designs(outcome: Outcome) -> dict[str, Design]:
-    return run.designs(outcome)
 
 
 @pytest.mark.parametrize(("name", "power"), [("centred", 1.0), ("centred_thousandth", 1e-3)])
@@ -110,33 +115,45 @@ def test_less_is_sent_for_as_much(designs: dict[str, Design]) -> None:
     assert plain.power == pytest.approx(2528 + 2579, abs=1)
 
 
+def by_seed(outcome: Outcome, quantity: str) -> list[dict[str, float]]:
+    """A quantity of each filter, one dict for each seed."""
+    return [
+        {name: values[i] for name, values in outcome.seeds[quantity].items()} for i in range(len(outcome.seeds["seed"]))
+    ]
+
+
 def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:
-    assert [t.seed for t in outcome.trials] == list(range(SEEDS))
-    for trial in outcome.trials:
-        aware, mean, extra = (trial.scores[name] for name in ("relay_aware", "mean_gain", "extra_noise"))
-        assert aware.position_rmse_m <= 2.2  # the project's own requirement, as the two below
-        assert 0.6 <= aware.nees_per_dimension <= 1.5
-        assert mean.position_rmse_m >= 2.3 * aware.position_rmse_m
-        assert mean.nees_per_dimension > 100
-        assert trial.scores["perfect_channel"].position_rmse_m < aware.position_rmse_m < extra.position_rmse_m
-        assert mean.position_rmse_m < trial.scores["open_loop"].position_rmse_m
+    assert outcome.seeds["seed"] == list(range(demo.Setting().seeds))
+    pairs = zip(by_seed(outcome, "position_rmse_m"), by_seed(outcome, "nees_per_dimension"), strict=True)
+    for error, nees in pairs:
+        assert error["relay_aware"] <= 2.2  # the project's own requirement, as the two below
+        assert 0.6 <= nees["relay_aware"] <= 1.5
+        assert error["mean_gain"] >= 2.3 * error["relay_aware"]
+        assert nees["mean_gain"] > 100
+        assert error["perfect_channel"] < error["relay_aware"] < error["extra_noise"]
+        assert error["mean_gain"] < error["open_loop"]
 
 
-def test_constants_of_one_drive_serve_another(outcome: Outcome) -> None:
+def test_constants_of_one_drive_serve_another(outcome: Outcome, learned: Learned, monkeypatch) -> None:
     """Only the gyro's rate at rest, beacons and start are the other drive's own."""
-    result = compute(read_recording("plaza1"), 0)
-    for trial in result.trials:
-        aware, mean = (trial.scores[name] for name in ("relay_aware", "mean_gain"))
-        assert aware.position_rmse_m <= 1.5  # the project's own requirement, as the three below
-        assert 0.6 <= aware.nees_per_dimension <= 1.6
-        assert mean.position_rmse_m >= 2.5 * aware.position_rmse_m
-        assert mean.nees_per_dimension > 100
-    first = [result.trials[0].scores[name].position_rmse_m for name in ("relay_aware", "mean_gain")]
-    said = "{:.2f} m where the mean gain gives {:.2f} m".format(*first)
-    assert said in " ".join((ROOT / "README.md").read_text().split())
-    published, known = run.summary(result), run.summary(outcome)
-    assert (published["recording"], published["rows"], known["recording"]) == ("Plaza1", 9660, "Plaza2")
-    assert list(published) == list(known)
+    monkeypatch.setattr(compute_module, "learn", lambda _: learned)
+    other = compute_module.compute(demo.Setting("plaza1"), Stages("demo", no_progress))
+    pairs = zip(by_seed(other, "position_rmse_m"), by_seed(other, "nees_per_dimension"), strict=True)
+    for error, nees in pairs:
+        assert error["relay_aware"] <= 1.5  # the project's own requirement, as the three below
+        assert 0.6 <= nees["relay_aware"] <= 1.6
+        assert error["mean_gain"] >= 2.5 * error["relay_aware"]
+        assert nees["mean_gain"] > 100
+    first = [other.first["position_rmse_m"][name] for name in ("relay_aware", "mean_gain")]
+    sentence = "{:.2f} m where the mean gain gives {:.2f} m".format(*first)
+    assert sentence in " ".join((ROOT / "README.md").read_text().split())
+    assert (other.recording, other.rows, outcome.recording) == ("Plaza1", 9660, "Plaza2")
+    text = filled(
+        Path(demo.__file__).with_name("page.md"),
+        {"setting": demo.Setting("plaza1"), **vars(other), **demo.example.words(other)},
+    )
+    assert "The constants come from another drive" in text and "in-sample" not in text
+    assert "--recording plaza1" in text and "demo.robot:plaza1" in text
 
 
 def test_relay_draws_follow_the_channel(recording: PlazaRecording) -> None:
@@ -181,13 +198,15 @@ def test_score_of_known_errors() -> None:
 def test_summary_holds_the_scores(folder: Path, outcome: Outcome, designs: dict[str, Design]) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["seed"] == 0
-    assert summary["seeds"]["seed"] == list(range(SEEDS))
-    assert summary["designs"] == {name: run.numbers(design) for name, design in designs.items()}
+    assert summary["seeds"]["seed"] == outcome.seeds["seed"]
+    assert summary["designs"] == {
+        name: {"rmse": d.rmse, "claimed": d.claimed, "power": d.power} for name, d in designs.items()
+    }
     for name in NAMES:
-        shown = outcome.trials[0].scores[name]
+        shown = outcome.shown.scores[name]
         assert summary["position_rmse_m"][name] == shown.position_rmse_m == summary["seeds"]["position_rmse_m"][name][0]
         assert summary["nees_per_dimension"][name] == shown.nees_per_dimension
-        assert len(summary["seeds"]["nees_per_dimension"][name]) == SEEDS
+        assert len(summary["seeds"]["nees_per_dimension"][name]) == len(outcome.seeds["seed"])
 
 
 def test_written_measurements_give_the_written_estimates(folder: Path) -> None:
@@ -217,29 +236,12 @@ def test_report_stands_alone(folder: Path, fits: Widths) -> None:
         assert text in html
 
 
-def test_table_is_printed_whole_in_80_columns(
-    outcome: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    run.print_table(outcome, tmp_path)
-    printed = capsys.readouterr().out
-    assert "…" not in printed
-    for row in compute_module.table_rows(outcome):
-        assert re.search(r"\s+".join(map(re.escape, row)), printed)
-
-
-def test_failure_leaves_nothing(
-    outcome: Outcome, designs: dict[str, Design], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path) -> None:
     def broken(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(run, "compute", lambda *_: outcome)
-    monkeypatch.setattr(run, "designs", lambda *_: designs)
-    monkeypatch.setattr(run, "learn", lambda *_: None)
-    monkeypatch.setattr(run, "write_data", broken)
     with pytest.raises(OSError, match="disk full"):
-        run.example(tmp_path / "a" / "b")
+        replace(demo.example, compute=lambda *_: outcome, data=broken).run(demo.Setting(), tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -247,34 +249,49 @@ def test_other_peoples_files_are_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "thesis.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"demo: expected .*, got other files"):
-        run.example(tmp_path)
+        demo.run(demo.Setting(), tmp_path)
     assert (tmp_path / "demo" / "thesis.txt").read_text() == "mine"
 
 
-def test_learning_without_the_truth_beats_the_calibration_on_the_second_half(learned: Learned) -> None:
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"recording": "plaza3"}, "recording: expected one of plaza1, plaza2, got .?plaza3"),
+        ({"seeds": 0}, "seeds: expected a positive whole number, got 0"),
+        ({"seed": 2**63}, "seed: expected"),
+    ],
+)
+def test_settings_that_are_none(change: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        demo.Setting(**change)
+
+
+def test_learning_without_the_truth_beats_the_calibration_on_the_second_half(
+    learned: Learned, fit: hg.learning.Fit
+) -> None:
     assert learned.rows == 908
-    assert learned.second_half.position_rmse_m <= 0.30  # the project's own requirement, as the next
-    assert learned.second_half_calibrated.position_rmse_m >= 0.33
-    assert learned.fit.converged and len(learned.fit.best.rows()) == 5
+    assert learned.second_half <= 0.30  # the project's own requirement, as the next
+    assert learned.second_half_calibrated >= 0.33
+    assert fit.converged and len(fit.best.rows()) == 5 == len(learned.parameters)
 
 
-def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned) -> None:
-    rows = {row.name: row for row in learned.fit.rows()}
-    gyro = rows["gyro_rate"]
-    assert gyro.low < learned.drift < gyro.high  # the truth, which it has not seen
-    assert learned.rest < gyro.low
-    assert "wrong while driving" in said(learned)
-    scale = rows["range_scale"]
-    assert scale.low < robot.RANGE_SCALE < scale.high
+def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned, folder: Path) -> None:
+    gyro = learned.parameters["gyro_rate"]
+    assert gyro.low is not None and gyro.high is not None
+    assert gyro.low < learned.gyro_rate_of_truth < gyro.high  # the truth, which it has not seen
+    assert learned.gyro_rate_at_rest < gyro.low
+    assert "wrong while driving" in (folder / "report.html").read_text(encoding="utf-8")
+    scale = learned.parameters["range_scale"]
+    assert scale.low is not None and scale.high is not None and scale.low < robot.RANGE_SCALE < scale.high
 
 
-def test_its_maximum_is_one_of_the_filters_own_likelihood(learned: Learned, recording: PlazaRecording) -> None:
+def test_its_maximum_is_one_of_the_filters_own_likelihood(fit: hg.learning.Fit, recording: PlazaRecording) -> None:
     """That of the filter with the learned constants, and less with each of them moved by a standard error."""
-    network = received_by_one(PLAZA2, robot.Constants(**learned.fit.values), hg.perfect(4))
+    network = single(PLAZA2, robot.Constants(**fit.values), hg.perfect(4))
     likelihood = hg.log_likelihood(
         network.nodes["robot"].filters["learned"], recording.ranges[:908], recording.odometry[:908]
     )
-    best = learned.fit.best
+    best = fit.best
     assert likelihood == pytest.approx(best.total, rel=1e-10)
     error = np.sqrt(np.diag(best.covariance()[0]))
     moved = best.x + np.concatenate([np.diag(error), -np.diag(error)])
@@ -290,13 +307,13 @@ def test_what_is_learned_behind_the_relay_is_its_gains_variance(recording: Plaza
     values = {"gain_variance": SECOND**2 - 1, "gyro_rate": 0.0, "range_scale": 1.0, "position_walk": 0.02}
     z = relay(robot.channel, recording.ranges, 0)[:50]
     item = describe(partial(relayed, PLAZA2)).at(values)
-    other = received_by_one(PLAZA2, constants, robot.channel)
+    other = single(PLAZA2, constants, robot.channel)
     sums = [hg.log_likelihood(n.nodes["robot"].filters["learned"], z, recording.odometry[:50]) for n in (item, other)]
     assert sums[0] == pytest.approx(sums[1], rel=1e-10)
 
 
 def test_what_was_learned_is_written_beside_the_scores(folder: Path, learned: Learned) -> None:
     result = json.loads((folder / "summary.json").read_text())["learned"]
-    assert result["second_half"] == learned.second_half.position_rmse_m
-    assert result["parameters"]["gyro_rate"]["estimate"] == learned.fit.values["gyro_rate"]
+    assert result["second_half"] == learned.second_half
+    assert result["parameters"]["gyro_rate"]["estimate"] == learned.parameters["gyro_rate"].estimate
     assert "What the ranges alone say" in (folder / "report.html").read_text(encoding="utf-8")
