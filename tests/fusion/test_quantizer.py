@@ -138,7 +138,7 @@ def sent_over(quantizer, values, arrives, restart=lambda k: False):
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), interval=st.integers(1, 7), loss=st.floats(0, 0.5))
-def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_told_again_within_the_interval(seed, interval, loss):
+def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_published_again_within_the_interval(seed, interval, loss):
     rng = np.random.default_rng(seed)
     values, arrives = rng.normal(size=25) * 10 ** rng.uniform(-4, 4, 25), rng.random(25) > loss
     quantizer = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3, interval=interval)

@@ -191,7 +191,7 @@ def test_the_snapshot_of_another_filter_is_refused_with_what_differs():
     hg.Stream.restore(same, data)  # equal is the same
     for other, what in (
         (hg.linear_filter(PLANT, hg.LinearSensor(np.eye(2), 0.6), hg.perfect(2)), r"\(numbers: \w+\)"),
-        (hg.linear_filter(PLANT, ROW, hg.perfect()), "numbers heard: 1"),
+        (hg.linear_filter(PLANT, ROW, hg.perfect()), "numbers received: 1"),
         (hg.cubature_filter(PLANT, SENSOR, hg.perfect(2)), "filter: "),
     ):
         with pytest.raises(ValueError, match=what):

@@ -119,7 +119,7 @@ def _written(record: "Record", out: Path | None, report: Path | None) -> list[st
 
 
 def _claim(estimate: "Estimate") -> str:
-    """What is claimed, and of how many rows nothing is."""
+    """Claim of the estimates, and of how many rows nothing is."""
     lost = int((estimate.claims == "none").sum())
     return estimate.claim if estimate.claim == "none" or not lost else f"{estimate.claim}, none of {lost} rows"
 

@@ -68,7 +68,7 @@ def scalars(value: Value) -> list[Node]:
 
 
 def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda item: True) -> set[Any]:
-    """What these numbers need: nodes, and the loops, guards, buffers and stores that make them; only `among` some."""
+    """Nodes, loops, guards, buffers and stores that these numbers need; only `among` some."""
     results: set[Any] = set()
     waiting: list[Any] = list(roots)
     while waiting:

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Summed(NamedTuple):
-    """Which outputs are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
+    """Outputs that are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
 
     outputs: tuple[bool, ...]
     batches: int

@@ -73,7 +73,7 @@ def weakest(claims: list[Claim]) -> Claim:
 
 
 def is_sound(estimate: Estimate) -> np.ndarray:
-    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    """Mask of the means that are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
     finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
     if estimate.claim == "none":
         return finite

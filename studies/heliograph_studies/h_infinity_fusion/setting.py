@@ -47,7 +47,7 @@ class Setting:
     sensing: tuple[float, ...] = (0.15, 0.2, 0.25, 0.3)
     feedthrough: tuple[float, ...] = (0.3, 0.15, 0.1, 0.25)
     disturbance: tuple[float, ...] = (-0.15, 0.15)
-    expected: tuple[float, ...] = (0.05, 0.05)
+    target: tuple[float, ...] = (0.05, 0.05)
     start: tuple[float, ...] = (2.0, 1.5)
     guesses: tuple[tuple[float, float], ...] = ((1.7, 1.6), (2.1, 1.4), (2.2, 1.7), (1.6, 1.3))
     weight: float = 15.0
@@ -78,7 +78,7 @@ class Setting:
     @property
     def M(self) -> np.ndarray:  # noqa: N802
         """What is to be known, as a row."""
-        return np.array([self.expected])
+        return np.array([self.target])
 
     @property
     def disturbances(self) -> np.ndarray:

@@ -33,7 +33,7 @@ class World(Module):
     measure: Callable[[jax.Array], jax.Array] = eqx.field(static=True)
     disturbance: np.ndarray
     feedthrough: np.ndarray
-    expected: np.ndarray
+    target: np.ndarray
     weight: np.ndarray
     inputs: np.ndarray
 
@@ -73,7 +73,7 @@ def worst_disturbance(
     rounds: int = 60,
 ) -> Worst:
     """Climb from `starts` random disturbances of each of the energies, and judge the best one on new draws."""
-    (time, _), n = world.inputs.shape, world.expected.shape[1]
+    (time, _), n = world.inputs.shape, world.target.shape[1]
     sizes = (n,), (n,), (time, world.disturbance.shape[1]), (time, draws.noise.shape[-1])
     random, items = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
     points = Disturbance(*(s * random.normal(size=(len(items), *size)) for s, size in zip(FIRST, sizes, strict=True)))
@@ -150,7 +150,7 @@ def _output_energy(filter: hg.filters.AbstractFilter, world: World, draws: Draws
             k, u, v, rho, gain, noise = item
             z = gain @ (world.measure(x) + world.feedthrough @ v) + noise @ rho
             state, estimate = filter.step(state, z, u, k)
-            missed = world.expected @ (x - estimate.mean)
+            missed = world.target @ (x - estimate.mean)
             return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
 
         begin = _from(filter, jnp.asarray(w.state - w.error))

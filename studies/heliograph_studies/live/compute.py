@@ -41,7 +41,7 @@ class Outcome:
     kills: int
     final_estimates: int
     final_estimates_identical: bool
-    told_again: int
+    published_again: int
     lost: int
     counted_twice: int
     steps_per_second: dict[str, int]
@@ -76,7 +76,7 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
         kills=restarted.kills,
         final_estimates=len(restarted.finals),
         final_estimates_identical=bool(alone) and alone == restarted.finals,
-        told_again=restarted.again,
+        published_again=restarted.again,
         lost=lost,
         counted_twice=twice,
         steps_per_second=speed,

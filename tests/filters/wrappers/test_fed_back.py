@@ -71,7 +71,7 @@ def test_a_nonlinear_sensor_takes_off_what_it_sends_of_the_prediction() -> None:
 
 def test_bad_nodes_are_one_clear_line() -> None:
     fed, other = fed_back_filter(PLANT, SENSOR, LINK), hg.linear_filter(PLANT, SENSOR, LINK)
-    with pytest.raises(ValueError, match="sensor hears back: expected no filter with measurements besides 'fed'"):
+    with pytest.raises(ValueError, match="sensor has feedback: expected no filter with measurements besides 'fed'"):
         hg.Node(SENSOR, LINK, {"fed": fed, "other": other})
     compass = hg.LinearSensor([[1.0]], 0.1, outputs=("heading",), circular=("heading",))
     turning = hg.LinearPlant([[1.0]], 0.1, [0.0], [[1.0]], states=("heading",), circular=("heading",))

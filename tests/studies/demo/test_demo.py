@@ -295,7 +295,7 @@ def test_its_maximum_is_one_of_the_filters_own_likelihood(fit: hg.learning.Fit, 
     assert likelihood == pytest.approx(best.total, rel=1e-10)
     error = np.sqrt(np.diag(best.covariance()[0]))
     moved = best.x + np.concatenate([np.diag(error), -np.diag(error)])
-    assert np.all(best.surface.result(moved).total < best.total - 0.05)
+    assert np.all(best.surface.evaluations(moved).total < best.total - 0.05)
 
 
 def test_what_is_learned_behind_the_relay_is_its_gains_variance(recording: PlazaRecording) -> None:
