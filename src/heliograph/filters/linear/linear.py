@@ -220,6 +220,11 @@ def linear_filter(
     information on the modes (`side_information_filter`). Behind a late link the past signals are estimated jointly,
     unless the delay is constant.
 
+    Inputs are taken as known in advance. Behind a random gain the noise depends on the second moment of the state, and
+    this is that of the plant under such inputs; an input computed from the estimates depends on the gains drawn, so in
+    closed loop the covariance is not the error's and the claim does not hold, worst for an unstable plant, whose moment
+    grows without bound.
+
     Args:
         plant: a linear plant, n states.
         sensor: a linear sensor, m outputs, with white noise.
