@@ -30,7 +30,7 @@ for steps in horizons:
         output=[[1.0, 0.0]],
         disturbance=[[0.0], [1.0]],
         feedthrough=[[0.0]],
-        expected=np.eye(2),
+        target=np.eye(2),
         channel=link,
         initial_weight=1.0,
     )

@@ -42,8 +42,8 @@ first = {}  # what was told of a step while it was the newest
 final = {}
 for _, message in known:
     if message["kind"] != "refused":
-        known = message["estimates"]["radio"]["aware"]
-        estimate = known["mean"][0], np.sqrt(known["covariance"][0][0])
+        claimed = message["estimates"]["radio"]["aware"]
+        estimate = claimed["mean"][0], np.sqrt(claimed["covariance"][0][0])
         (first if message["kind"] == "provisional" else final).setdefault(message["time"], estimate)
 
 fig, (top, bottom) = plt.subplots(2, 1, figsize=(9, 5.2), sharex=True, height_ratios=[3, 2], layout="constrained")

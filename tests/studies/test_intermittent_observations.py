@@ -133,7 +133,7 @@ def test_verdicts_follow_the_evidence(result):
     apart = {name: item._replace(upper=item.lower + 0.05) for name, item in critical.items()}
     other = {name: item._replace(lower=0.3, upper=0.3) for name, item in critical.items()}
     low = link._replace(mean_error=1.0)
-    known = {name: item._replace(verdict="undecided") for name, item in result.unpublished.items()}
+    known = {name: item._replace(verdict="undecided") for name, item in result.unknown_losses.items()}
     cases = [
         ({"critical": meeting}, {"With one output", "The conditions always meet"}),
         (
@@ -151,7 +151,7 @@ def test_verdicts_follow_the_evidence(result):
         ({"turning": 1 - 0.5 ** np.arange(18.0)}, {"The lower condition"}),
         ({"iterated": result.iterated._replace(subtracted=result.iterated.joseph)}, {"A V A'"}),
         ({"constant": critical["scalar"]}, {"The steady gain"}),
-        ({"untold": known}, {"Losses that the receiver"}),
+        ({"unknown_losses": known}, {"Losses that the receiver"}),
         ({"typical": 1e9}, {"Where E P diverges"}),
     ]
     seen = set()

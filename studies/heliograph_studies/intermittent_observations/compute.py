@@ -107,7 +107,7 @@ class Outcome:
     below: Unlisted[np.ndarray]
     turning: Unlisted[np.ndarray]
     between_bound: Unlisted[float]
-    unpublished: Unlisted[dict[str, Boundedness]]
+    unknown_losses: Unlisted[dict[str, Boundedness]]
     iterated: Unlisted[Iterated]
     typical: Unlisted[float]
     curves: Unlisted[dict[str, Curves]]
@@ -157,7 +157,7 @@ def patterns(setting: Setting, critical: dict[str, CriticalArrival]) -> dict[str
         "below": over_patterns(setting.coupled, low, setting.patterns),
         "turning": over_patterns(setting.turning, (turning.lower + turning.upper) / 2, setting.patterns),
         "between_bound": judge(setting.coupled, lossy(setting.between)).radius,
-        "untold": {
+        "unknown_losses": {
             "dropout": judge(setting.scalar, hg.dropout(hg.perfect(), 0.99)),
             "fading": judge(setting.scalar, hg.hop(hg.Rayleigh(1.0), 0.1)),
         },

@@ -189,7 +189,7 @@ def _errata(result: Outcome) -> list[Statement]:
     it, constant, scalar = result.iterated, result.constant, result.critical["scalar"]
     right = abs(it.joseph[-1] / result.coupled.bound - 1)
     wrong = abs(it.subtracted[-1] / result.coupled.bound - 1)
-    unpublished = "; ".join(f"{name}: {item.verdict}, {item.reason}" for name, item in result.unpublished.items())
+    unknown_losses = "; ".join(f"{name}: {item.verdict}, {item.reason}" for name, item in result.unknown_losses.items())
     return [
         Statement("A V A' + Q - arrival K S K' can be iterated as it stands", "the equation as printed everywhere",
             "exact arithmetic", f"coupled example, {len(it.joseph)} steps: tr V = {it.subtracted[-1]:.6g}, since V's "
@@ -202,8 +202,8 @@ def _errata(result: Outcome) -> list[Statement]:
             {"fixed_gain": constant.upper, "known": scalar.upper},
             lambda fixed_gain, known: holds(fixed_gain - known < THRESHOLD)),
         Statement("Losses that the receiver is not told have a critical probability too", "taken for granted at times",
-            "a threshold", unpublished,
-            {"impossible": float(sum(item.verdict == "impossible" for item in result.unpublished.values()))},
+            "a threshold", unknown_losses,
+            {"impossible": float(sum(item.verdict == "impossible" for item in result.unknown_losses.values()))},
             lambda impossible: holds(impossible == 0)),
         Statement("Where E P diverges, so does P", "refuted by Shi, Epstein and Murray (2010)", "diverges",
             f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is {result.typical:.3f} "

@@ -43,7 +43,7 @@ class OverNats:
         except nats.js.errors.NoStreamResponseError:  # no service was there yet
             return
 
-    async def known(self) -> list[bytes]:
+    async def published(self) -> list[bytes]:
         client = await nats.connect(self.url)
         reader = await client.jetstream().subscribe("contract.out.*.*", ordered_consumer=True)
         results = []
@@ -71,7 +71,7 @@ class OverMqtt:
     async def send(self, bodies: Sequence[bytes]) -> None:
         await asyncio.to_thread(published, self.where, list(bodies))
 
-    async def known(self) -> list[bytes]:
+    async def published(self) -> list[bytes]:
         return list(self.received)
 
 
