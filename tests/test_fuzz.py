@@ -20,7 +20,7 @@ COINS = hg.LinearPlant([[0.9]], COIN, [0.0], 1.0), hg.LinearSensor([[1.0]], COIN
 RECEIVER = {"receiver": {"s": HOP}}, {"receiver": {"r": HOP}}
 SLOTS = [{"r": {"sensor": HOP}, **RECEIVER[0]}, {"s": {"sensor": HOP}, **RECEIVER[1]}]
 RELAYS = model.RelayNetwork(*SCALAR, ("r", "s"), SLOTS)
-BELOW_ONE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
+SINGLE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
 LINK = {"plant": PLANT, "sensor": SENSOR, "channel": HOP}
 SYSTEM = linear.lifted_system(*SCALAR, HOP, 1, 3)
 SCHEDULE = linear.lmmse(SYSTEM)
@@ -54,7 +54,7 @@ CALLS = [  # what is called, and arguments with which it works
     (hg.kalman_filter, {"plant": PLANT, "sensor": SENSOR, **PRIOR}),
     (hg.linear_filter, LINK),
     (hg.filters.open_loop_filter, {"plant": PLANT, **PRIOR}),
-    (hg.polynomial_filter, {**BELOW_ONE, "horizon": 3, "degree": 1}),
+    (hg.polynomial_filter, {**SINGLE, "horizon": 3, "degree": 1}),
     (hg.mixture_filter, {"plant": COINS[0], "sensor": COINS[1], "channel": hg.perfect(), "resolution": 0.0}),
     (hg.Fusion, {"filter": "f", "rule": hg.fusion.EqualIntersection(), "quantizer": ESCAPE}),
     (hg.Network, {"plant": PLANT, "nodes": {"a": NODE}, "fused": {"c": hg.Fusion("f", hg.fusion.EqualIntersection())}}),
@@ -83,8 +83,8 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.Independent, {"parts": [COIN]}),
     (random_affine.Shaped, {"matrix": [[1.0], [2.0]], "source": COIN}),
     (random_affine.second_order, {"channel": HOP}),
-    (linear.lifted_system, {**BELOW_ONE, "degree": 1, "horizon": 3}),
-    (linear.gain_over_linear, {**BELOW_ONE, "horizon": 3}),
+    (linear.lifted_system, {**SINGLE, "degree": 1, "horizon": 3}),
+    (linear.gain_over_linear, {**SINGLE, "horizon": 3}),
     (linear.lmmse, {"system": SYSTEM, "claim": "exact"}),
     (linear.true_covariance, {"system": SYSTEM, "schedule": SCHEDULE}),
     (linear.state_moments, {"system": SYSTEM}),
@@ -107,7 +107,7 @@ CALLS = [  # what is called, and arguments with which it works
     (filters.ScheduledFilter, {"schedule": SCHEDULE, "states": ["x"]}),
     (filters.LinearSystemFilter, {"system": SYSTEM, "states": ["x"]}),
     (filters.PolynomialFilter, {"inner": filters.ScheduledFilter(SCHEDULE), "degree": 1}),
-    (filters.memory_filter, {**BELOW_ONE, "horizon": 3}),
+    (filters.memory_filter, {**SINGLE, "horizon": 3}),
     (fusion.UniformQuantizer, {"levels": 8, "amplitude": 1.0, "scale": 1.0}),
     (fusion.EscapeQuantizer, {"levels": 9, "amplitude": 1.0, "decay": 0.5, "growth": 0.1, "smallest": 1e-3}),
     (ESCAPE.init, {"n": 1}),

@@ -31,7 +31,7 @@ def ready(arguments):
 NOISE = np.random.default_rng(0).normal(size=5000)
 CHAIN = [[0.9, 0.1], [0.2, 0.8]]
 BURST = hg.gilbert_elliott(HOP, hg.hop(0.5, 0.1), 0.1, 0.2)
-BELOW_ONE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
+SINGLE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
 NETWORK = hg.Network(PLANT, {"a": NODE, "b": NODE}, {"all": hg.Fusion("f", fusion.MatrixWeights())})
 RECORD = Later(lambda: hg.monte_carlo(hg.Network(PLANT, {"a": NODE}), 3, 2, 0))
 GROWTH = h_infinity.growth_system(
@@ -89,15 +89,15 @@ CALLS = [  # what is called, and arguments with which it works
                              "name": "f", "seed": 0}),
     (filters.h_infinity_filter, {"plant": PLANT, "sensor": SENSOR, "system": GROWTH, "design": DESIGN,
                                  "initial_mean": [0.0, 0.0]}),
-    (filters.as_current_filter, BELOW_ONE),
+    (filters.as_current_filter, SINGLE),
     (filters.late_filter, {"filter": KALMAN, "delay": 2}),
     (filters.part_filter, {"filter": KALMAN, "states": 1}),
     (filters.clock_filter, {**PAIR, "clocks": ["b"], "transform": filters.PolynomialMoments(2)}),
-    *((f, {**BELOW_ONE, "channel": BURST}) for f in
+    *((f, {**SINGLE, "channel": BURST}) for f in
     (filters.side_information_filter, filters.imm_filter, filters.gpb1_filter,
                                                filters.gpb2_filter, filters.mode_known_filter,
                                                filters.mode_late_filter, filters.memoryless_filter)),
-    (filters.particle_filter, {**BELOW_ONE, "particles": 10, "seed": 0, "nodes": 3}),
+    (filters.particle_filter, {**SINGLE, "particles": 10, "seed": 0, "nodes": 3}),
     (filters.true_error, {"filter": KALMAN, "plant": PLANT, "sensor": SENSOR, "channel": hg.perfect(), "horizon": 3,
                           "inputs": None}),
     (smoothing.FixedLag, {"lag": 2}),

@@ -13,7 +13,7 @@ ROOTS = [Path(heliograph.__file__).parent, Path(heliograph_studies.__file__).par
 PRIVATE = {
     "told", "heard", "hears", "hearing", "foretell", "foretelling", "foretold", "settled", "settling", "settle",
     "mould", "tape", "ears", "air", "antenna", "shadow", "shadows", "whose", "nowhere", "keeping", "beside", "purchase",
-    "purchases", "revealed", "retain", "retains", "smoother_steps", "retaining", "surprise",
+    "purchases", "revealed", "retain", "retains", "smoother_steps", "retaining", "surprise", "surprises",
 }  # as a part of an identifier too  # fmt: skip
 VAGUE = {"own", "found", "kept", "wanted", "asked", "one", "each", "many"}  # as a whole identifier
 OTHERS = {"one"}  # a method of another library's results, used as theirs

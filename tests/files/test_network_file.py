@@ -11,8 +11,8 @@ plant = h.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=["{state}"])
 sensor = h.LinearSensor([[1.0]], 0.1)
 {name} = h.Network(plant, {{"only": h.Node(sensor, h.perfect(), {{}})}})
 """
-BELOW_ONE = NETWORK.format(state="x", name="network")
-TWO = BELOW_ONE + NETWORK.format(state="y", name="other")
+SINGLE = NETWORK.format(state="x", name="network")
+TWO = SINGLE + NETWORK.format(state="y", name="other")
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +38,7 @@ def refused(reference: str, *fragments: str) -> None:
 
 
 def test_the_only_network_of_a_file(in_folder):
-    (in_folder / "net.py").write_text(BELOW_ONE + "\nsame = network\n")
+    (in_folder / "net.py").write_text(SINGLE + "\nsame = network\n")
     assert load_network("net.py").states == ("x",)
     assert load_network(str(in_folder / "net.py")).states == ("x",)
     assert [p.name for p in in_folder.iterdir()] == ["net.py"]
@@ -53,7 +53,7 @@ def test_a_named_network_of_several(in_folder):
 
 
 def test_a_function_that_returns_one(in_folder):
-    source = BELOW_ONE + "\ndef build():\n    return network\n\ndef needs(seed):\n    return network\n"
+    source = SINGLE + "\ndef build():\n    return network\n\ndef needs(seed):\n    return network\n"
     (in_folder / "net.py").write_text(source + "\ndef wrong():\n    return 3\n")
     assert load_network("net.py:build").states == ("x",)
     refused("net.py:needs", "TypeError", "seed")
@@ -76,13 +76,13 @@ def test_a_file_finds_modules_beside_it(in_folder):
     folder = in_folder / "elsewhere"
     folder.mkdir()
     (folder / "shared_settings.py").write_text("GAIN = 0.5\n")
-    (folder / "net.py").write_text("from shared_settings import GAIN\n" + BELOW_ONE)
+    (folder / "net.py").write_text("from shared_settings import GAIN\n" + SINGLE)
     assert load_network("elsewhere/net.py").states == ("x",)
 
 
 def test_a_dataclass_in_the_file(in_folder):
     extra = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
-    (in_folder / "net.py").write_text(extra + "@dataclass\nclass Setting:\n    a: int = 1\n" + BELOW_ONE)
+    (in_folder / "net.py").write_text(extra + "@dataclass\nclass Setting:\n    a: int = 1\n" + SINGLE)
     assert load_network("net.py").states == ("x",)
 
 

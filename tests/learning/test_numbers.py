@@ -40,8 +40,8 @@ def test_what_does_not_move_stays_and_the_impossible_is_given_up():
     fixed = maximise(evaluate, np.array([[0.0, 0.3]]), np.array([[True, False]]))
     assert fixed.converged[0] and fixed.x[0, 1] == 0.3
     assert abs(evaluate(fixed.x)[1][0, 0]) < 1e-6
-    none_at_all = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
-    assert not none_at_all.converged[0]
+    impossible = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
+    assert not impossible.converged[0]
 
 
 def test_long_run_covariances_of_an_autoregression():

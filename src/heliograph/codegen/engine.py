@@ -120,7 +120,7 @@ def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differ
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
-        return Choice(None, f"the function holds what cannot be told from another: {error}")
+        return Choice(None, f"the function holds an object that cannot be compared with another: {error}")
     return Choice(code, why, arrays)
 
 

@@ -27,8 +27,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
     """Yield an empty folder that replaces `target` at the end; after an error or interrupt `target` is unchanged.
 
     Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
-    aside
-    are restored.
+    aside are restored.
     """
     clear_left(target)
     made = [folder for folder in target.parents if not folder.exists()]

@@ -47,7 +47,7 @@ def route_sentences(solution: "Solution") -> list[str]:
         report = [
             f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})"
             for kind, value, row in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True)
-            if solution.report(row)
+            if solution.identifies(row)
             for reach in [quantile(freedom) * float(np.sqrt(max(row @ covariance @ row, 0.0)))]
         ]
         if report:

@@ -124,7 +124,7 @@ class Solution:
     ) -> Row:
         if entry.place is not None and not self.active[entry.place]:
             return self._at_boundary(entry, value)
-        if not self.report(slopes):
+        if not self.identifies(slopes):
             return Row(entry.name, value, np.nan, np.nan, np.nan, self.form, False, False)
         error = float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
         center = link(entry.domain, value)
@@ -134,12 +134,12 @@ class Solution:
             low, high = center + self._drawn(slopes)
         else:
             low, high = center + quantile(freedom) * error * np.array([-1.0, 1.0])
-        item, other = sorted(float(unlink(entry.domain, end)) for end in (low, high))
+        least, most = sorted(float(unlink(entry.domain, end)) for end in (low, high))
         width = abs(float(unlink(entry.domain, center + 1e-6) - unlink(entry.domain, center - 1e-6))) / 2e-6
-        return Row(entry.name, value, item, other, error * width, self.form, False, True)
+        return Row(entry.name, value, least, most, error * width, self.form, False, True)
 
-    def report(self, slopes: Float[np.ndarray, " active"]) -> bool:
-        """Whether the data tell a function of the coordinates with this derivative."""
+    def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
+        """Decide whether the data identify a function of the coordinates with this derivative."""
         along = self.rank.unit * slopes
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)

@@ -38,9 +38,8 @@ def critical_arrival(
     The receiver knows of losses. lower = 1 - 1/rho(A)^2: while nothing arrives P grows by rho(A)^2 a step. upper: the
     smallest arrival at which some K passes rho((1 - arrival) A x A + arrival (A - K C) x (A - K C)) < 1. With as many
     independent outputs as states they meet. Known in the field, and not proved here: where the unstable eigenvalues
-    have
-    distinct moduli, `lower` is the truth (You, Fu and Xie, 2011; Mo and Sinopoli, 2012). Process noise must reach the
-    unstable modes for anything to diverge.
+    have distinct moduli, `lower` is the truth (You, Fu and Xie, 2011; Mo and Sinopoli, 2012). Process noise must reach
+    the unstable modes for anything to diverge.
 
     Args:
         plant: linear plant, constant over time.

@@ -19,10 +19,8 @@ class Gains(NamedTuple):
 
     One row per step (one step: no axis). transition F, gain K, offset c, output L, direct J, output_offset d. The
     prediction of z is G s + g with `expected` G and `expected_offset` g: it replaces what did not arrive. `covariance`
-    is
-    that of x - xhat; `predicted` of x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. The last two are
-    NaN
-    where unknown.
+    is that of x - xhat; `predicted` of x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. The last two
+    are NaN where unknown.
     """
 
     transition: Float[np.ndarray, "*time N N"]

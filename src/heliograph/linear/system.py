@@ -40,8 +40,7 @@ class LinearSystem(Module):
         covariance_: its covariance (N, N).
         projection: W (q, N).
         rounding: absolute rounding error of the diagonal of `process` (time, N), where it came out of a subtraction;
-            zero
-            unless given, like the next two.
+            zero unless given, like the next two.
         received_rounding: the same of `noise` (time, m).
         start_rounding: the same of `covariance_` (N,).
 

@@ -21,7 +21,7 @@ class HeldRow:
         self.numbers[-1] = key[0]
         self.events: dict[tuple[int, int, float], Float[np.ndarray, " size"]] = {}
 
-    def observe(self) -> bool:
+    def has_data(self) -> bool:
         """Return whether the row has an event of a node; its other events are inputs."""
         return any(place >= 0 for place, _, _ in self.events)
 

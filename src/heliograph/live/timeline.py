@@ -123,7 +123,7 @@ class Timeline:
             verdict = "implausible"
         if verdict == "used":
             self.now = now
-            self._solve_steady()
+            self._finalise()
         if verdict in ("used", "implausible") and dropped:
             self.dropped[node] += dropped
         self.counts[node][verdict] += 1
@@ -140,7 +140,7 @@ class Timeline:
     def advance(self, now: float) -> None:
         """Advance the time: what is older than the window becomes final."""
         self.now = max(self.now, moment("now", now))
-        self._solve_steady()
+        self._finalise()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
         """Return estimates at `now` by node and filter; those of several nodes are under "fused"."""
@@ -294,7 +294,7 @@ class Timeline:
             )
         return [np.asarray(leaf) for leaf in outputs]
 
-    def _solve_steady(self) -> None:
+    def _finalise(self) -> None:
         """Move the base up to the watermark."""
         base, forced = self._rows.finalise(self.now - self.window)
         if not base:
@@ -303,7 +303,7 @@ class Timeline:
         final, left = self._rows.drop(base)
         count = len(self._rows.held)
         self._order[:count] = self._order[base : base + count].copy()
-        self._unread += [row for row in final if row.observe()]
+        self._unread += [row for row in final if row.has_data()]
         self._left += [row.slot for row in left]
 
     def _collect(self) -> None:

@@ -29,8 +29,7 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
     """Return the channel that sends y - r: z = G (y - r) + n + E[G] r, where the receiver knows r and adds E[G] r.
 
     E[z | y] is that of the channel itself; power and the gain's noise see E (y - r)^2 in place of E y^2. Any sensor,
-    linear
-    or not, and any filter take the result, and so does a relay between two hops.
+    linear or not, and any filter take the result, and so does a relay between two hops.
 
     Args:
         channel: a channel without delays and erasures, constant or an `OverTime`.

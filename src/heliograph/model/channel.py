@@ -118,8 +118,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
     Args:
         link: the link without delay.
         delay: d in steps; a `Discrete` law from which d is drawn at each step; or a `MarkovChain` whose mode is d.
-            Drawn
-            delays may deliver one y twice, or never.
+            Drawn delays may deliver one y twice, or never.
         timestamped: True if the receiver knows d, as the last number of z; False unless given.
 
     Raises:

@@ -83,8 +83,8 @@ def with_clocks(
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
-    sensor
-    then measures the plant o before that time, h = y - o dy/dt. The new states are "NODE_offset" and "NODE_drift".
+    sensor then measures the plant o before that time, h = y - o dy/dt. The new states are "NODE_offset" and
+    "NODE_drift".
 
     Args:
         plant: the plant, constant over time.

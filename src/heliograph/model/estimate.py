@@ -42,15 +42,13 @@ class Innovation(Module):
     """Innovation of a measurement: z - E[z | earlier data], its covariance and its log-likelihood.
 
     Components that did not arrive are NaN in value and covariance. A filter that claims no covariance has NaN in all
-    but
-    the value.
+    but the value.
 
     Args:
         value: z minus its prediction (..., m).
         covariance: covariance of the innovation as the filter computes it (..., m, m).
         log_likelihood: log p(components that arrived | earlier data) as the filter sees it (...), 0 when nothing
-            arrived;
-            log N(value; 0, covariance) unless the filter says otherwise.
+            arrived; log N(value; 0, covariance) unless the filter says otherwise.
     """
 
     value: Float[Array, "... m"]

@@ -28,18 +28,15 @@ class RelayNetwork(Module):
 
     At step k the sensor sends y_k = C_k x_k + v_k and relay r sends C_k s_r, with s_r its estimate at k - 1: what it
     receives at k, it can only forward later. A listener receives the sum of its links. A relay that listens and
-    transmits
-    in one slot is full duplex; its link to itself is self-interference. Links are independent of each other and over
-    time;
-    a link that is an OverTime is read at the step, not at the slot.
+    transmits in one slot is full duplex; its link to itself is self-interference. Links are independent of each other
+    and over time; a link that is an OverTime is read at the step, not at the slot.
 
     Args:
         plant: linear plant without inputs.
         sensor: linear sensor.
         relays: names of the relays.
         slots: one dictionary for each slot of the schedule, used in turn from the first: slots[k][listener][sender] is
-            the
-            link, a random affine map. Senders are "sensor" and the relays, listeners the relays and "receiver".
+            the link, a random affine map. Senders are "sensor" and the relays, listeners the relays and "receiver".
 
     Raises:
         ValueError: no slots; a schedule in which nobody transmits to the receiver, or a relay that receives nothing but
@@ -143,10 +140,8 @@ class Steps(Module):
     """Matrices of a relay network that its second moments need, for each step (leading axis).
 
     The F filters together receive R numbers; T = (1 + relays) m numbers are sent: y, then the signal of each relay.
-    With
-    W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij : W
-    (noise
-    included). Rows with `live` = 1 have some link; `state_mean` is E x before the step.
+    With W = E (sent, 1)(sent, 1)', what is received has mean gain sent + offset and conditional covariance spread_ij :
+    W (noise included). Rows with `live` = 1 have some link; `state_mean` is E x before the step.
 
     Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
     (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, live (time, R), spread

@@ -58,16 +58,14 @@ class Sensor(AbstractSensor):
     """Nonlinear sensor y = h(x) + v.
 
     The number of outputs is that of their names, of the covariance matrix, or of the noise law; a single variance
-    without
-    names means one output.
+    without names means one output.
 
     Args:
         measure: h(x), from (n,) to (outputs,), written with jax.numpy.
         noise: law of v, its covariance (outputs, outputs), or a variance.
         outputs: names of the outputs.
         circular: names of outputs that are angles in radians; a channel must leave them unchanged (gain 1), but for
-            noise
-            and erasures.
+            noise and erasures.
 
     Raises:
         ValueError: names, noise and function that disagree about the number of outputs, circular outputs that are none.

@@ -59,9 +59,8 @@ def continued(
     """Return the function with its angular results continued from `center`, so that no jump is taken for a change.
 
     f(x) is taken near f(center) + D (x - center), where D is the Jacobian of resulting angles by given angles, rounded
-    to
-    whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is taken
-    within half a turn of its value at the center.
+    to whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is
+    taken within half a turn of its value at the center.
     """
     if not result:
         return function

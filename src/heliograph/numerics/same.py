@@ -14,8 +14,7 @@ def same(item: Any, other: Any) -> bool:
     """Return one bool for objects that hold arrays: of the same class, and the same in each part.
 
     Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
-    same
-    as itself alone.
+    same as itself alone.
     """
     if item is other:
         return True

@@ -221,12 +221,12 @@ def anonymous(channel: T) -> T:
 
 def one_memory(items: Sequence[T]) -> list[T]:
     """The same maps at later steps: unnamed memories of each are those of the first, in order of appearance."""
-    owners = [memories(item) for item in items]
-    if not owners[0] or len({len(held) for held in owners}) > 1:
+    by_item = [memories(item) for item in items]
+    if not by_item[0] or len({len(held) for held in by_item}) > 1:
         return list(items)
     labels = [
-        {identity: label for (identity, m), label in zip(held.items(), owners[0], strict=True) if m.name is None}
-        for held in owners
+        {identity: label for (identity, m), label in zip(held.items(), by_item[0], strict=True) if m.name is None}
+        for held in by_item
     ]
     return [_relabelled(item, label) for item, label in zip(items, labels, strict=True)]
 

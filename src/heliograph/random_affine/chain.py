@@ -28,8 +28,7 @@ class Nodes(NamedTuple):
     """Finitely many states of a memory: their law at the first use, and row by row that of the next given the present.
 
     The rows sum to 1. Their entries are probabilities for a chain; for a drifting fading they reproduce all
-    expectations
-    of polynomials up to a degree, and may be negative.
+    expectations of polynomials up to a degree, and may be negative.
     """
 
     states: jax.Array | np.ndarray

@@ -97,9 +97,8 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """Return links in series, each with its own delay; constant delays add up.
 
     A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
-    gains
-    and noises are independent over time. One that stores it for a random time may forward one value twice, with one
-    noise.
+    gains and noises are independent over time. One that stores it for a random time may forward one value twice, with
+    one noise.
 
     Raises:
         ValueError: no links, time stamps on the way, memory before a delay.

@@ -246,15 +246,13 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     """Combine the memories of a channel in one chain, the first slowest, with the map given each joint mode.
 
     The transition is Pi_a x Pi_b (Kronecker). f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j);
-    of
-    maps that share one, f(a_i, b_i).
+    of maps that share one, f(a_i, b_i).
 
     Args:
         channel: any map.
         nodes: number of modes of a drifting fading, which then becomes the chain with the same mean, variance and
             correlation, with probabilities. None (default): as many nodes as make the means in each mode and the
-            products
-            over time exact for monomials of H up to `order`; their transition may have negative entries.
+            products over time exact for monomials of H up to `order`; their transition may have negative entries.
         order: degree of H for which expectations are exact, 1 unless given.
 
     Raises:

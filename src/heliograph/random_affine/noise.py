@@ -99,8 +99,8 @@ def _root(covariance_: Square) -> np.ndarray:
     """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
-    eigenvalue
-    below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that have none.
+    eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
+    have none.
     """
     matrix = np.asarray(covariance_)
     deviation = np.sqrt(np.diagonal(matrix))

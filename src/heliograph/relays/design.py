@@ -113,8 +113,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     """Return every filter of a design as a schedule of gains, to save, to simulate or to run.
 
     s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
-    "exact"
-    for complete data from the network it was designed for.
+    "exact" for complete data from the network it was designed for.
 
     Raises:
         ValueError: a design of another network.

@@ -49,10 +49,8 @@ def receiver_error_design(
         horizon: number of steps.
         weights: weight_k (horizon,); those that give the mean of tr P_k / tr P_k(own-error design) unless given.
         power_limit: bound on the power that all relays send at each step, a number or (horizon,), in squared units of
-            the
-            sensor, met to 1e-6; none unless given. It can't be less than the power of the mean state, which every
-            unbiased
-            estimate sends.
+            the sensor, met to 1e-6; none unless given. It can't be less than the power of the mean state, which every
+            unbiased estimate sends.
         sweeps: number of sweeps, 200 unless given.
 
     Raises:

@@ -160,9 +160,9 @@ class Fleet:
         results: list[list[float]] = self.pool.table[slots, self.pool.outputs].tolist() if slots else []
         return results
 
-    def forget(self, converged: Iterable[Finalised]) -> None:
+    def forget(self, finalised: Iterable[Finalised]) -> None:
         """Free the slots of these rows, once their outputs have been read."""
-        for item in converged:
+        for item in finalised:
             self.pool.give(item.left)
 
 

@@ -20,7 +20,7 @@ class Tallies(Collector):
     def collect(self) -> Iterable[Metric]:
         """Yield the current metrics."""
         yield from _links(self.watch)
-        yield from _surprises(self.watch)
+        yield from _nis(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
@@ -44,14 +44,14 @@ def _links(watch: Watch) -> Iterable[Metric]:
     return messages, lost, dropped
 
 
-def _surprises(watch: Watch) -> Iterable[Metric]:
+def _nis(watch: Watch) -> Iterable[Metric]:
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
         "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels
     )
     low = GaugeMetricFamily("heliograph_nis_low", "Least that is expected of an honest filter.", labels=labels)
     high = GaugeMetricFamily("heliograph_nis_high", "Most that is expected of an honest filter.", labels=labels)
-    for key, item in watch.surprises.items():
+    for key, item in watch.nis.items():
         for metric, value in zip((ratio, low, high), (item.ratio, *item.band()), strict=True):
             metric.add_metric(list(key), value)
     return ratio, low, high

@@ -105,9 +105,9 @@ class Service:
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
         last = list(self.plants.values()) if ended and not self.store.keeps else []
-        converged = self.fleet.finalise(last, all_=True)
-        entries = self._finals(converged)
-        self.fleet.forget(converged)
+        finalised = self.fleet.finalise(last, all_=True)
+        entries = self._finals(finalised)
+        self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
@@ -136,10 +136,10 @@ class Service:
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
         # Step what is due; estimates of final rows are committed, provisional ones only published.
-        converged = self.fleet.finalise(touched.values())
-        entries += self._finals(converged)
-        provisional = self._provisional([item for item in converged if item.plant.name in used])
-        self.fleet.forget(converged)
+        finalised = self.fleet.finalise(touched.values())
+        entries += self._finals(finalised)
+        provisional = self._provisional([item for item in finalised if item.plant.name in used])
+        self.fleet.forget(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
         committed = perf_counter() - begun
@@ -187,21 +187,21 @@ class Service:
             plant = self.plants[name] = plant_from(name, item.body, self.fleet)
             plant.version = item.version
 
-    def _finals(self, converged: Iterable[Finalised]) -> list[Entry]:
+    def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
-        rows = [(item.plant, row) for item in converged for row in item.final if row.observe()]
+        rows = [(item.plant, row) for item in finalised for row in item.final if row.has_data()]
         outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [
             Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
             for (plant, row), numbers in zip(rows, outputs, strict=True)
         ]
 
-    def _provisional(self, converged: Sequence[Finalised]) -> list[Output]:
+    def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
         """Return the provisional estimates at the newest rows."""
-        outputs = self.fleet.outputs([item.newest.slot for item in converged])
+        outputs = self.fleet.outputs([item.newest.slot for item in finalised])
         return [
             Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
-            for (plant, _, newest, _), numbers in zip(converged, outputs, strict=True)
+            for (plant, _, newest, _), numbers in zip(finalised, outputs, strict=True)
         ]
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:

@@ -99,7 +99,7 @@ class Watch:
         self.states = list(states)
         self.lock = threading.Lock()
         self.services: list[Serves] = []
-        self.surprises: dict[tuple[str, str], RunningNis] = {}
+        self.nis: dict[tuple[str, str], RunningNis] = {}
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._count = 0
@@ -131,7 +131,7 @@ class Watch:
         for node, filters in estimates.items():
             for name, message in filters.items():
                 if message.get("nis") is not None:
-                    for item in (self.surprises, local):
+                    for item in (self.nis, local):
                         single = item.setdefault((node, name), RunningNis(message["claim"]))
                         single.add(message["nis"], message["received"])
 

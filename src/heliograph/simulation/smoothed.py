@@ -157,7 +157,7 @@ def _fused_claim(network: Network, name: str, item: Fusion | AbstractFilter, cla
     return item.claim([claims[node][item.filter] for node in network.nodes_with(item.filter)])
 
 
-def _warn_of_nis(network: Network, nis: PyTree) -> None:
+def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
     """Warn of filters that are not consistent, from sums of the NIS over blocks and runs."""
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
@@ -176,7 +176,7 @@ def found_record(network: Network, part: Part | None, result: PyTree, time: np.n
     """Record of a recording, with its smoothed part."""
     if part is None:
         return trajectories_record(network, {"truth": None, **result}, time)
-    _warn_of_nis(part.network, result["nis"])
+    _warn_of_inconsistency(part.network, result["nis"])
     filtered = trajectories_record(network, {"truth": None, **result["filtered"]}, time)
     length = result["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(part.network, {"truth": None, **result["smoothed"]}, time[-length:])
@@ -226,6 +226,6 @@ class WithSmoothed(AbstractReducer[Result]):
 
     def finished(self, carry: PyTree, collected: PyTree, network: Network, part: Part) -> Result:
         """Make the result of the network with that of its smoothed part; warn of filters that are not consistent."""
-        _warn_of_nis(part.network, carry[2])
+        _warn_of_inconsistency(part.network, carry[2])
         smoothed = self.reducer.finish(carry[1], collected[1], part.network)
         return self.reducer.others(self.finish(carry, collected, network), smoothed, part.claims)

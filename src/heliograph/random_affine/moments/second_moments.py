@@ -108,8 +108,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
 
     Exact for a gain common to all components, else dominating. With one scalar gain g, the largest E_v (g - mu)^2,
     (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
-    probabilities
-    have their maxima.
+    probabilities have their maxima.
 
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.

@@ -80,9 +80,9 @@ class Nats:
                 self._reader = None
                 continue
             self._read = count
-            return Batch([message.data for message in messages], partial(self._solve_steady, messages[-1]))
+            return Batch([message.data for message in messages], partial(self._acknowledge, messages[-1]))
 
-    async def _solve_steady(self, last: Msg) -> None:
+    async def _acknowledge(self, last: Msg) -> None:
         """Acknowledge everything up to this message; if the server misses it, the messages come again as duplicates."""
         self._acknowledged = last.metadata.sequence.stream
         with contextlib.suppress(*AWAY):

@@ -76,7 +76,7 @@ class LinearisedCentre(Module):
             step = _shared_step(matrix, keep, local.gain)
             errors = _advanced(before.errors, step, motion.noise, local.noise)
             if isinstance(rule, AllReports):
-                step = step._replace(drift=_nis(before.rule, matrix, moved, keep, local))
+                step = step._replace(drift=_drift(before.rule, matrix, moved, keep, local))
             after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, local.noise, errors), reports)
             following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
         return following, results
@@ -102,7 +102,7 @@ def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorSt
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
 
 
-def _nis(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
+def _drift(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
     """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)

@@ -142,8 +142,8 @@ class ErrorStatistics:
         broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
         self._tell()
         if np.any(broken):
-            none_at_all = np.full(self.outer.shape[-1], np.nan)
-            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), none_at_all)
+            undefined = np.full(self.outer.shape[-1], np.nan)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
         halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
         return max(halves, key=lambda w: w.ratio)
 

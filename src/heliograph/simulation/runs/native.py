@@ -66,7 +66,7 @@ def native(
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
-        raise Unsupported("a network that holds what cannot be told from another") from None
+        raise Unsupported("a network with an object that cannot be compared with another") from None
     if isinstance(made, Unsupported):
         raise Unsupported(made.operation, made.place)
     program, form = made
