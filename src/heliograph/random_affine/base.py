@@ -1,6 +1,7 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -129,6 +130,74 @@ class AbstractRandomAffine(Module):
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
+
+
+class AbstractOfOne(AbstractRandomAffine):
+    """Random affine map made of one other, with its shapes, state and extremes unless it says otherwise."""
+
+    base: eqx.AbstractVar[AbstractRandomAffine]
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map inside."""
+        return self.base.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the map inside."""
+        return self.base.inputs
+
+    @property
+    def erases(self) -> bool:
+        """True if the map inside erases."""
+        return self.base.erases
+
+    def around(self, base: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of another."""
+        return replace(self, base=base)
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map inside."""
+        return self.base.init(key)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Return the same map made of each extreme of the map inside."""
+        return tuple(self.around(m) for m in self.base.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the map inside."""
+        return self.base.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """The same map made of the one inside with its mean gain."""
+        return self.around(self.base.mean_gain())
+
+
+class AbstractOfOneShape(AbstractRandomAffine):
+    """Random affine map that is at each step one of several maps of one shape."""
+
+    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    @property
+    def erases(self) -> bool:
+        """True if one of the maps erases."""
+        return any(m.erases for m in self.maps)
+
+    def check_shapes(self, name: str) -> None:
+        """Raise ValueError where the maps have several shapes."""
+        shapes = [(m.outputs, m.inputs) for m in self.maps]
+        if len(set(shapes)) != 1:
+            raise fail(name, "maps of one shape", shapes)
 
 
 def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:

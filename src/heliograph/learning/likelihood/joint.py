@@ -7,7 +7,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
-from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.noise import Independent
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
