@@ -135,42 +135,60 @@ class AbstractRandomAffine(Module):
 class AbstractOfOne(AbstractRandomAffine):
     """Random affine map made of one other, with its shapes, state and extremes unless it says otherwise."""
 
-    base: eqx.AbstractVar[AbstractRandomAffine]
+    @property
+    def inside(self) -> AbstractRandomAffine:
+        """The map that this one is made of."""
+        raise NotImplementedError
+
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of another."""
+        raise NotImplementedError
 
     @property
     def outputs(self) -> int:
         """Outputs of the map inside."""
-        return self.base.outputs
+        return self.inside.outputs
 
     @property
     def inputs(self) -> int:
         """Inputs of the map inside."""
-        return self.base.inputs
+        return self.inside.inputs
 
     @property
     def erases(self) -> bool:
         """True if the map inside erases."""
-        return self.base.erases
-
-    def around(self, base: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of another."""
-        return replace(self, base=base)
+        return self.inside.erases
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """State of the map inside."""
-        return self.base.init(key)
+        return self.inside.init(key)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the same map made of each extreme of the map inside."""
-        return tuple(self.around(m) for m in self.base.extremes())
+        return tuple(self.around(m) for m in self.inside.extremes())
 
     def corner_count(self) -> int:
         """Count of the map inside."""
-        return self.base.corner_count()
+        return self.inside.corner_count()
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """The same map made of the one inside with its mean gain."""
-        return self.around(self.base.mean_gain())
+        """Return the same map made of the one inside with its mean gain."""
+        return self.around(self.inside.mean_gain())
+
+
+class AbstractWithBase(AbstractOfOne):
+    """Random affine map made of one other, its field `base`."""
+
+    base: eqx.AbstractVar[AbstractRandomAffine]
+
+    @property
+    def inside(self) -> AbstractRandomAffine:
+        """The base."""
+        return self.base
+
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map with another base."""
+        return replace(self, base=inside)
 
 
 class AbstractOfOneShape(AbstractRandomAffine):

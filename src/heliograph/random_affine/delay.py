@@ -29,13 +29,13 @@ class AbstractOfLine(AbstractOfOne):
         raise NotImplementedError
 
     @property
-    def base(self) -> AbstractRandomAffine:
+    def inside(self) -> AbstractRandomAffine:
         """The map of the line."""
         return self.line
 
-    def around(self, base: AbstractRandomAffine) -> AbstractRandomAffine:
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return another map of the line, as late."""
-        return OfLine(base, self.past)
+        return OfLine(inside, self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the map of the line."""

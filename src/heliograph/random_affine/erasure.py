@@ -7,12 +7,12 @@ from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.moments.moments import Moments
 
 
-class Erasure(AbstractOfOne):
+class Erasure(AbstractWithBase):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine

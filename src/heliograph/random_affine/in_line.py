@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.numerics.check import fail
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps
 from heliograph.random_affine.combine import Mixture, Series
 from heliograph.random_affine.delay import AbstractOfLine, Delay, Delayed, of_line, sent
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
 
 
-class Held(AbstractOfOne):
+class Held(AbstractWithBase):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.

@@ -18,9 +18,9 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import (
     AbstractModal,
-    AbstractOfOne,
     AbstractOfOneShape,
     AbstractRandomAffine,
+    AbstractWithBase,
     as_maps,
     check_forgets,
     given,
@@ -107,7 +107,7 @@ class ModeOutput(AbstractModal):
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
 
 
-class OneStepLate(AbstractOfOne):
+class OneStepLate(AbstractWithBase):
     """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine
