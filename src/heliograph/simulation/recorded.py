@@ -17,6 +17,7 @@ from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
@@ -47,7 +48,8 @@ def run(
     nothing happens to them by chance.
 
     Values beyond a node's limits, and what is implausible for all filters of a node (`heliograph.filters
-    .plausibility`), count as not arrived; each is warned of, with its rows from 1.
+    .plausibility`), count as not arrived; each is warned of, with its rows from 1. So is a value that the rule of its
+    sender forbids; it is used.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
@@ -65,6 +67,12 @@ def run(
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     for name in network.names:
         z[name] = _within(name, network.nodes[name], z[name])
+        if rows := forbidden_rows(network.nodes[name], z[name]):
+            warnings.warn(
+                f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+                "within delta of the value before, and no heartbeat due",
+                stacklevel=2,
+            )
     part = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):

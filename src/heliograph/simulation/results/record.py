@@ -32,6 +32,8 @@ class Record(Saved):
     (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
     reports[name][node] of each fusion that hears reports.
     time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
+    transmissions[node] (run, time, m) of simulated nodes with a trigger: the `model.SendReason` for which each
+    component was sent, negative where it was lost, 0 where it was not sent.
     smoothed: the same of estimates given later data too, where these were asked for: a record of its own to save.
     """
 
@@ -44,6 +46,7 @@ class Record(Saved):
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
+    transmissions: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
@@ -127,6 +130,7 @@ class Record(Saved):
     def apart(self) -> list[str]:
         """What is saved apart."""
         there = {"smoothed": self.smoothed is not None, "reports": bool(self.reports)}
+        there["transmissions"] = bool(self.transmissions)
         return [name for name, is_there in there.items() if is_there]
 
     def plot(
