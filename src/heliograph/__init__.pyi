@@ -48,6 +48,15 @@ from .model.fading import (
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
 )
+from .model.trigger import (
+    Periodic as Periodic,
+    SendOnDelta as SendOnDelta,
+    SendOnPredictionError as SendOnPredictionError,
+    StochasticTrigger as StochasticTrigger,
+)
+from .filters.event.factory import (
+    event_filter as event_filter,
+)
 from .filters.gaussian.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,

@@ -13,6 +13,7 @@ from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.recordings import gathered
 from heliograph.learning.likelihood.surface import StoppedError, Surface
+from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
 from heliograph.numerics.readable import readable
@@ -119,7 +120,7 @@ def fit(
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Fit:
+) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 
     `network` is a function that returns a Network in which numbers are marked by `hg.free`. `recording`: what
@@ -128,6 +129,10 @@ def fit(
     linear plants the linear form comes first, which is right whatever the laws; from there the conditional one, which
     is sharper. `starts`: the given one, and others drawn around it with the seed. `progress` is told each step in a
     line. Ctrl-C keeps the best so far.
+
+    Behind a sender that decides when to send (`trigger` of a node) the likelihood is that of `event_filter`, silence
+    included; delta and losses are free numbers like others. A heartbeat is a whole number: fit with each that may be,
+    and compare `log_likelihood`. The result is a `SenderFit`.
 
     Shapes: inputs (steps, inputs), for each recording if they differ.
 
@@ -138,6 +143,8 @@ def fit(
     """
     check_count("starts", starts)
     description = describe(network)
+    if decides(description.start):
+        return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
     data = gathered(description.start, recording, inputs, description.parameters.size)
     surfaces = [Surface(objective, data) for objective in objectives(description)]
     say: Progress = progress or (lambda line: None)
