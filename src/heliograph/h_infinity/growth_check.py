@@ -67,18 +67,18 @@ class GrowthFinding(NamedTuple):
 
     @property
     def starts_at_zero(self) -> bool:
-        """Truth of f(0) = 0, to rounding of what the constant allows over the box."""
+        """True if f(0) = 0, to rounding of what the constant allows over the box."""
         return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
 
     @property
     def refuted(self) -> bool:
-        """Truth of: a pair, a slope or f(0) breaks the constant."""
+        """True if a pair, a slope or f(0) breaks the constant."""
         steep = self.differences and not self.slope <= self.limit
         return steep or not self.ratio <= self.limit or not self.starts_at_zero
 
     @property
     def proved(self) -> bool:
-        """Truth of: no slope in the box exceeds the constant, for certain."""
+        """True if no slope in the box exceeds the constant, for certain."""
         return not self.refuted and self.bound is not None and self.bound <= self.limit
 
     @property

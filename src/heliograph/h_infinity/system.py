@@ -24,7 +24,7 @@ class Growth(NamedTuple):
 
     @property
     def absent(self) -> bool:
-        """Truth of: the function is zero throughout."""
+        """True if the function is zero throughout."""
         return not (np.any(self.state) or np.any(self.error))
 
 

@@ -44,7 +44,7 @@ class FeedbackLimit(NamedTuple):
 
     @property
     def bounded(self) -> bool:
-        """Truth of: the error stays bounded."""
+        """True if the error stays bounded."""
         return self.noise < self.limit
 
 

@@ -155,7 +155,7 @@ def _stacked(nodes: list[Received]) -> tuple[Array, Array]:
 def received(
     name: str, source: Source, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
 ) -> Received:
-    """Describe a node's reception of states with E (x, 1)(x, 1)', in steps that repeat `forever` or begin with the first.
+    """Describe a node's reception of states with E (x, 1)(x, 1)'; steps repeat `forever` or begin with the first.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed.

@@ -108,7 +108,7 @@ class PowerTask(NamedTuple):
 
     @property
     def convex(self) -> bool:
-        """Truth of: no path has two free hops; then j is concave in its power, and the error convex."""
+        """True if no path has two free hops; then j is concave in its power, and the error convex."""
         return is_convex(self.problem.path)
 
     def whole(self) -> SplitPaths:
