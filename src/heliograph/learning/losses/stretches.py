@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, check_count, fail, items, rank, table
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, Shaped
 
 Fates = list[Float[np.ndarray, " packets"]]
 
