@@ -29,9 +29,14 @@ Likelihood = Callable[[Float[np.ndarray, " p"]], float]
 @readable
 @dataclass(frozen=True)
 class SenderFit:
-    """What a fit found behind a sender that decides: as `Fit`, with intervals by the profile of the likelihood.
+    """Result of a fit behind a sender that decides: as `Fit`, with intervals by the profile of the likelihood.
 
-    `x` is the maximum on the line, `total` its log-likelihood, `table` a row for each number.
+    Args:
+        description: the network with free numbers.
+        x: the maximum on the line, (p,).
+        total: log-likelihood of the maximum, in nats.
+        table: a row for each number.
+        converged: True if the search for the maximum converged.
     """
 
     description: Description
@@ -52,7 +57,7 @@ class SenderFit:
 
     @property
     def log_likelihood(self) -> dict[str, float]:
-        """At the maximum, in nats."""
+        """Log-likelihood at the maximum, in nats, by its form."""
         return {"conditional": self.total}
 
     def rows(self) -> tuple[Row, ...]:
@@ -61,7 +66,7 @@ class SenderFit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What there is to say."""
+        """Remarks on the fit; none where the search converged."""
         return () if self.converged else ("The search did not converge: the estimates are the best points found.",)
 
     def __str__(self) -> str:
@@ -72,7 +77,7 @@ class SenderFit:
 
 
 def decides(network: Network) -> bool:
-    """Whether a sender of the network decides when to send."""
+    """Return True if a sender of the network decides when to send."""
     return any(isinstance(node, Node) and node.trigger is not None for node in network.nodes.values())
 
 
@@ -99,6 +104,7 @@ def fit_sender(
         raise fail(
             "free numbers of a sender that decides", "numbers with limits of their own", "a simplex or covariance"
         )
+    # The likelihood of all recordings at a point of the line.
     data = gathered(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
@@ -107,6 +113,7 @@ def fit_sender(
         total = sum(float(log_likelihood(item, z[:n], u[:n])) for z, u, n in rows)
         return total if np.isfinite(total) else -1e300
 
+    # The best of several starts, and the profile of each number.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
     ends = [_highest(likelihood, np.asarray(point)) for point in points]
@@ -148,6 +155,7 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
         point[place] = value
         return float(description.parameters.entries_at(point)[index])
 
+    # Doubled steps until the profile is below, then bisection.
     ends = []
     for sign in (-1.0, 1.0):
         inside, outside = 0.0, 0.05

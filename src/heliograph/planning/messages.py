@@ -29,7 +29,14 @@ REACH = 12.0  # deviations at which a density ends
 
 
 class MessageRate(NamedTuple):
-    """Transmissions a step, and mean square errors of the states, (n,); both with standard errors, 0 where exact."""
+    """Rate of messages and mean square errors, with their standard errors, which are 0 where they are exact.
+
+    Args:
+        rate: transmissions a step.
+        error: mean square errors of the states, (n,).
+        rate_error: standard error of the rate.
+        error_error: standard errors of the errors, (n,).
+    """
 
     rate: float
     error: np.ndarray
@@ -47,7 +54,7 @@ class _Scalar(NamedTuple):
 
     @property
     def kalman_variance(self) -> float:
-        """Of the sender's own Kalman filter in the long run."""
+        """Error variance of the sender's Kalman filter in the long run."""
         a, q, r = self.a, self.q, self.r / self.c**2
         b = r * (1 - a * a) - q
         prior = (-b + np.sqrt(b * b + 4 * q * r)) / 2
@@ -66,6 +73,15 @@ def simulated_rate(
     """Rate and error of `event_filter` behind a rule, by simulation: any plant, any link.
 
     Means over the last three quarters of the steps.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        channel: the link, with its losses.
+        trigger: the sender's rule.
+        runs: number of simulated runs.
+        horizon: steps of a run.
+        seed: seed of the draws.
 
     Raises:
         ValueError: parts that do not fit; counts below 2 runs and 4 steps.
@@ -129,6 +145,12 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
     The curve of `prediction_error_rate`, whose thresholds are optimal for first-order plants: published for links
     without loss (Lipsa and Martins 2011) and with losses that are acknowledged (Chakravorty and Mahajan 2020); here it
     is computed, not proved.
+
+    Args:
+        plant: a linear plant of one state.
+        sensor: a linear sensor of one output.
+        rate: transmissions a step.
+        loss: probability that a transmission is lost.
 
     Raises:
         ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
@@ -213,6 +235,11 @@ def _cells(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     """The delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
 
+    Args:
+        plant: a linear plant of one state.
+        sensor: a linear sensor of one output.
+        rate: transmissions a step.
+
     Raises:
         ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
     """
@@ -221,7 +248,7 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 
 
 def _threshold(rate: float, of: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
-    """Where a rate that falls with delta is what is asked for."""
+    """Find the threshold at which a rate that falls with delta has a value."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
     unit = np.sqrt(system.q * system.c**2 + system.r)
