@@ -35,14 +35,16 @@ class Innovation(Module):
     value: z - E[z | what came before]; covariance: what the filter believes of it. Both are NaN in the components that
     did not arrive. log_likelihood: log p(components that arrived | what came before) as the filter sees it, 0 when
     nothing arrived; a Gaussian one, log N(value; 0, covariance), unless the filter says otherwise. A filter that claims
-    no covariance has none: then all but the value is NaN.
+    no covariance has none: then all but the value is NaN. weight: how much each component counted, from 0 (left out) to
+    1 (in full), of a filter that weighs them; None of all others.
 
-    Shapes: value (..., m), covariance (..., m, m), log_likelihood (...).
+    Shapes: value and weight (..., m), covariance (..., m, m), log_likelihood (...).
     """
 
     value: Float[Array, "... m"]
     covariance: Float[Array, "... m m"]
     log_likelihood: Float[Array, "..."]
+    weight: Float[Array, "... m"] | None = None
 
 
 def weakest(claims: list[Claim]) -> Claim:
