@@ -26,6 +26,10 @@ from .random_affine.law import (
 from .random_affine.noise import (
     Gaussian as Gaussian,
 )
+from .random_affine.outliers import (
+    Contaminated as Contaminated,
+    StudentT as StudentT,
+)
 from .model.plant import (
     LinearPlant as LinearPlant,
     Plant as Plant,
@@ -70,6 +74,12 @@ from .filters.linear.linear import (
 )
 from .filters.linear.polynomial import (
     polynomial_filter as polynomial_filter,
+)
+from .filters.gaussian.adaptive import (
+    adaptive_filter as adaptive_filter,
+)
+from .filters.gaussian.robust import (
+    robust_filter as robust_filter,
 )
 from .filters.modes.mixture import (
     mixture_filter as mixture_filter,
