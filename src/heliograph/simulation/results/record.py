@@ -51,6 +51,8 @@ class Record(Saved):
         units: by the state's name, and of "time"; empty where they were not given.
         smoothed: record of estimates given later data too; None where these were not asked for. It is saved separately.
         reports: by fusion and node, of each fusion that uses reports.
+        transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
+            was sent, negative where it was lost, 0 where it was not sent.
     """
 
     time: np.ndarray
@@ -62,6 +64,7 @@ class Record(Saved):
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
+    transmissions: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
@@ -192,7 +195,8 @@ class Record(Saved):
 
     def apart(self) -> list[str]:
         """Names of the parts that are saved separately."""
-        return super().apart() + (["reports"] if self.reports else [])
+        there = {"reports": bool(self.reports), "transmissions": bool(self.transmissions)}
+        return super().apart() + [name for name, is_there in there.items() if is_there]
 
     def plot(
         self,
