@@ -8,7 +8,7 @@ from typing import TypedDict
 
 from heliograph.campaign.plan import Campaign, Setting
 from heliograph.campaign.work import Job, Reply
-from heliograph.disk.durable import naming, replace
+from heliograph.disk.whole_file import naming, replace
 
 FAILURES = "failures.json"
 

@@ -23,8 +23,7 @@ from heliograph.campaign.store import (
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
 from heliograph.disk.holding import only_here
-from heliograph.disk.output_file import check_output_folder
-from heliograph.disk.output_folder import check_replaceable, clear_left
+from heliograph.disk.output_file import check_output_folder, check_replaceable, clear_left
 from heliograph.numerics.check import check_count, fail, file_path, instance
 from heliograph.numerics.readable import readable
 

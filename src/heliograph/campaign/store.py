@@ -21,8 +21,8 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from heliograph.campaign.labels import Claims, Labels, labels_from
 from heliograph.campaign.plan import Campaign, Chunk
 from heliograph.campaign.read import read_campaign
-from heliograph.disk.durable import sync
-from heliograph.disk.output_folder import whole_folder
+from heliograph.disk.output_file import whole_folder
+from heliograph.disk.whole_file import sync
 from heliograph.numerics.check import fail
 
 STORE = "results.zarr"

@@ -32,6 +32,7 @@ from .storage.identity import (
 from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
+    connected as connected,
 )
 from .brokers.pipe import (
     Pipe as Pipe,
@@ -39,9 +40,6 @@ from .brokers.pipe import (
 from .brokers.url import (
     Address as Address,
     address as address,
-)
-from .brokers.broker import (
-    connected as connected,
 )
 from .brokers.partition import (
     Part as Part,

@@ -11,9 +11,9 @@ from pathlib import Path
 from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.brokers.broker import connected
 from heliograph.serving.brokers.partition import Part
 from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes

@@ -10,7 +10,7 @@ import nats
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.brokers.broker import connected
+from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes

@@ -1,10 +1,31 @@
-"""Interface of a transport: how messages reach a service and outputs leave it."""
+"""Transports of messages: their interface, the one of a broker, and repeated attempts with waits that grow."""
 
+import asyncio
+import logging
+import random
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from heliograph.numerics.check import InputError
+from heliograph.serving.brokers.partition import WHOLE, Part
+from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
+
+
+def connected(address: Address, part: Part = WHOLE) -> Transport:
+    """Return the transport for one part of the plants through the broker at this address.
+
+    Args:
+        address: the broker; its `kind`, mqtt or nats, selects the protocol.
+        part: the part of the plants whose messages are read; by default all.
+    """
+    if address.kind == "mqtt":
+        from heliograph.serving.brokers.mqtt import Mqtt
+
+        return Mqtt(address, part)
+    from heliograph.serving.brokers.nats import Nats
+
+    return Nats(address, part)
 
 
 class Batch(NamedTuple):
@@ -41,3 +62,33 @@ class Transport(Protocol):
 
 async def nothing() -> None:
     """Acknowledge to a sender that expects no answer."""
+
+
+LOG = logging.getLogger("heliograph.serving")
+FIRST, LONGEST = 0.25, 30.0  # seconds
+
+
+def still_needed() -> None:
+    """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+class Retry:
+    """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
+
+    def __init__(self, what: str):
+        self.what, self._wait = what, FIRST
+
+    async def wait(self, error: Exception) -> None:
+        """Log the failure, and wait before the next attempt."""
+        still_needed()
+        wait = self._wait * random.uniform(0.5, 1.0)
+        LOG.warning("%s: %s; trying again in %.1f s", self.what, type(error).__name__, wait)
+        self._wait = min(2 * self._wait, LONGEST)
+        await asyncio.sleep(wait)
+
+    def worked(self) -> None:
+        """Reset the wait after a success."""
+        self._wait = FIRST
