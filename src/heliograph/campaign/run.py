@@ -123,8 +123,8 @@ def _run(
             failed = _compute(engine, campaign, store, missing, already, tell)
     remove_partial(store)
     # Reports are written again after every call.
-    failures = [failure(campaign, job, reply) for job, reply in failed.items()]
-    write_failures(out, campaign, failures, tried=expected)
+    failures = [failure(campaign, out, job, reply) for job, reply in failed.items()]
+    write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
     return CampaignRun(out, already, len(missing) - lacking, failures, damaged)

@@ -228,11 +228,7 @@ def _build(
 
 
 def imm_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """Interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
@@ -258,11 +254,7 @@ def imm_filter(
 
 
 def gpb1_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """First-order generalised pseudo-Bayes filter behind links with memory: one Gaussian and the modes' probabilities.
 
@@ -286,11 +278,7 @@ def gpb1_filter(
 
 
 def gpb2_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """Second-order generalised pseudo-Bayes filter: a Gaussian per mode, each updated in every next mode, M^2 updates.
 

@@ -37,11 +37,7 @@ class Native(NamedTuple):
 
 
 def native(
-    world: World,
-    inputs: np.ndarray,
-    key: jax.Array,
-    reducer: AbstractReducer[Any],
-    later: Smoother | None = None,
+    world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], later: Smoother | None = None
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
