@@ -11,10 +11,17 @@ from typing import TypeAlias
 import numpy as np
 import zarr
 
-from heliograph.campaign.labels import Labels
 from heliograph.campaign.page import finding, pictures, score_table
 from heliograph.campaign.plan import BITWISE, Campaign
-from heliograph.campaign.store import CLAIM, STORE, done_chunks, parameter_values, stored_campaign, stored_labels
+from heliograph.campaign.store import (
+    CLAIM,
+    STORE,
+    Labels,
+    done_chunks,
+    parameter_values,
+    stored_campaign,
+    stored_labels,
+)
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
 from heliograph.report.explore_page import STATIC, Explored, Quantity, Value, explore_html

@@ -7,14 +7,17 @@ from pathlib import Path
 
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, failure, write_failures
-from heliograph.campaign.labels import Description, check_within, join, labels_from
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
+    Description,
     check_same,
+    check_within,
     create,
     described,
     done_chunks,
+    join,
+    labels_from,
     remove_damaged,
     remove_partial,
     stored_labels,

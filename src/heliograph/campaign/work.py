@@ -11,9 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.campaign.labels import Description, Labels, check_within, describe, labels_from
 from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
-from heliograph.campaign.store import stored_labels, write_chunk
+from heliograph.campaign.store import (
+    Description,
+    Labels,
+    check_within,
+    describe,
+    labels_from,
+    stored_labels,
+    write_chunk,
+)
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import alike
 from heliograph.numerics.check import fail
