@@ -9,14 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.check import fail, items, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
-from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.moments.moments import Moments
-from heliograph.random_affine.moments.monomials import monomials
 
 T = TypeVar("T")
 
@@ -352,10 +350,3 @@ def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
     """z = G y + n for a drawn H."""
     return h[:-1, :-1] @ y + h[:-1, -1]
-
-
-def conditional_moments(
-    channel: AbstractRandomAffine, y: ArrayLike, order: int
-) -> Float[jax.Array | np.ndarray, " rows"]:
-    """E[mono_order(z) | y] for a given point y."""
-    return channel.moments(order).expect(monomials(array("point y", y, (channel.inputs,)), order))
