@@ -10,8 +10,7 @@ import numpy as np
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import quantile
-from heliograph.learning.likelihood.joint import joint_world
-from heliograph.learning.likelihood.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.objective import Data, Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text

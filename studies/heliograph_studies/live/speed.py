@@ -17,9 +17,8 @@ from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.in_memory_store import InMemoryStore
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import InMemoryStore, identity
 from heliograph_studies.live.server import Server
 
 PLANTS = 100  # mowers on the same drive, each a little after the one before

@@ -1,13 +1,16 @@
-"""Transports of messages: their interface, the one of a broker, and repeated attempts with waits that grow."""
+"""Transports of messages: their interface, the one of a broker, partitions of plants, attempts with waits that grow.
+
+All messages of a plant are in one part, by a hash of its name.
+"""
 
 import asyncio
 import logging
 import random
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
+from urllib.parse import quote
 
-from heliograph.numerics.check import InputError
-from heliograph.serving.brokers.partition import WHOLE, Part
+from heliograph.numerics.check import InputError, check_count, text
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 
@@ -92,3 +95,40 @@ class Retry:
     def worked(self) -> None:
         """Reset the wait after a success."""
         self._wait = FIRST
+
+
+OFFSET, PRIME = 0x811C9DC5, 0x01000193
+NAMELESS = "_"  # the word for the plant that has no name
+
+
+class Part(NamedTuple):
+    """One part of the plants: its `number`, counted from 0, and the number of parts, `of`."""
+
+    number: int = 0
+    of: int = 1
+
+
+WHOLE = Part()
+
+
+def word(plant: str) -> str:
+    """Encode a plant's name as one word of a topic or subject: letters, digits and hyphens stay, others become %XX."""
+    text("plant", plant)
+    return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
+
+
+def part_of(plant: str, parts: int) -> int:
+    """Return the part that a plant is in.
+
+    Args:
+        plant: name of the plant.
+        parts: number of parts, at least 1.
+
+    Returns:
+        The number of the part, 0 <= number < `parts`.
+    """
+    check_count("parts", parts)
+    value = OFFSET
+    for byte in word(plant).encode():
+        value = (value ^ byte) * PRIME & 0xFFFFFFFF
+    return value % parts
