@@ -1,6 +1,9 @@
 """Transports of messages: their interface, the one of a broker, partitions of plants, attempts with waits that grow.
 
-All messages of a plant are in one part, by a hash of its name.
+A broker that hands each message to whichever process is free (a shared subscription of MQTT 5, a consumer with many
+readers) would spread a plant over processes. So the plants are cut into a fixed number of parts, and a part is read by
+one process at a time. The hash is FNV-1a of 32 bits modulo the number of parts, since that is what a NATS server
+computes itself; a sender to MQTT writes the part into the topic.
 """
 
 import asyncio
