@@ -35,6 +35,28 @@ class Expected:
 
 
 @readable
+class Comparison(NamedTuple):
+    """Test of whether a recording speaks for the first of two laws or for the second.
+
+    Args:
+        difference: mean of log p_a - log p_b per step, in nats.
+        standard_error: its standard error, which allows for correlation over time.
+        z: difference over standard error.
+        p_value: two-sided p-value of z.
+    """
+
+    difference: float
+    standard_error: float
+    z: float
+    p_value: float
+
+    @property
+    def decided(self) -> bool:
+        """True if the data speak for one law at 5 %, the first where the difference is positive."""
+        return self.p_value < 0.05
+
+
+@readable
 @dataclass(frozen=True)
 class Change:
     """Filter on the held-out rows, with the numbers that the network began with and with those learned.
@@ -112,28 +134,6 @@ def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> E
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
-
-
-@readable
-class Comparison(NamedTuple):
-    """Test of whether a recording speaks for the first of two laws or for the second.
-
-    Args:
-        difference: mean of log p_a - log p_b per step, in nats.
-        standard_error: its standard error, which allows for correlation over time.
-        z: difference over standard error.
-        p_value: two-sided p-value of z.
-    """
-
-    difference: float
-    standard_error: float
-    z: float
-    p_value: float
-
-    @property
-    def decided(self) -> bool:
-        """True if the data speak for one law at 5 %, the first where the difference is positive."""
-        return self.p_value < 0.05
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:

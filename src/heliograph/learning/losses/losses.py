@@ -19,6 +19,7 @@ from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
 INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
+
 LONG = 4  # packets back that the longer of the two chains looks
 
 
@@ -32,6 +33,29 @@ class HeldOutScores(NamedTuple):
     log_likelihood: float
     gain: float
     gain_error: float
+
+
+@readable
+class LossMemory(NamedTuple):
+    """Result of two tests of losses that are independent by assumption.
+
+    Args:
+        likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known; chi-square with
+            one degree of freedom if the losses are independent.
+        likelihood_p: its p-value.
+        runs_z: number of runs of equal fates, less what is expected, in standard deviations: negative for bursts.
+        runs_p: its two-sided p-value.
+    """
+
+    likelihood_ratio: float
+    likelihood_p: float
+    runs_z: float
+    runs_p: float
+
+    @property
+    def significant(self) -> bool:
+        """True if the likelihood ratio rejects independence at 1 %."""
+        return self.likelihood_p < 0.01
 
 
 @readable
@@ -122,29 +146,6 @@ def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Hel
         gain, error = mean_and_error(item - said[INDEPENDENT])
         result[name] = HeldOutScores(float(item.mean()), gain, error)
     return result
-
-
-@readable
-class LossMemory(NamedTuple):
-    """Result of two tests of losses that are independent by assumption.
-
-    Args:
-        likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known; chi-square with
-            one degree of freedom if the losses are independent.
-        likelihood_p: its p-value.
-        runs_z: number of runs of equal fates, less what is expected, in standard deviations: negative for bursts.
-        runs_p: its two-sided p-value.
-    """
-
-    likelihood_ratio: float
-    likelihood_p: float
-    runs_z: float
-    runs_p: float
-
-    @property
-    def significant(self) -> bool:
-        """True if the likelihood ratio rejects independence at 1 %."""
-        return self.likelihood_p < 0.01
 
 
 def loss_memory(fates: object) -> LossMemory:

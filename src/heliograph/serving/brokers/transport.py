@@ -18,22 +18,6 @@ from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 
 
-def connected(address: Address, part: Part = WHOLE) -> Transport:
-    """Return the transport for one part of the plants through the broker at this address.
-
-    Args:
-        address: the broker; its `kind`, mqtt or nats, selects the protocol.
-        part: the part of the plants whose messages are read; by default all.
-    """
-    if address.kind == "mqtt":
-        from heliograph.serving.brokers.mqtt import Mqtt
-
-        return Mqtt(address, part)
-    from heliograph.serving.brokers.nats import Nats
-
-    return Nats(address, part)
-
-
 class Batch(NamedTuple):
     """Messages that were received together.
 
@@ -44,10 +28,6 @@ class Batch(NamedTuple):
 
     payloads: Sequence[bytes]
     acknowledge: Callable[[], Awaitable[None]]
-
-
-class TakenOverError(InputError):
-    """Loss of the messages to another process, which reads them now."""
 
 
 class Transport(Protocol):
@@ -66,11 +46,42 @@ class Transport(Protocol):
         """Release the resources of the transport."""
 
 
+class Part(NamedTuple):
+    """One part of the plants: its `number`, counted from 0, and the number of parts, `of`."""
+
+    number: int = 0
+    of: int = 1
+
+
+WHOLE = Part()
+
+
+def connected(address: Address, part: Part = WHOLE) -> Transport:
+    """Return the transport for one part of the plants through the broker at this address.
+
+    Args:
+        address: the broker; its `kind`, mqtt or nats, selects the protocol.
+        part: the part of the plants whose messages are read; by default all.
+    """
+    if address.kind == "mqtt":
+        from heliograph.serving.brokers.mqtt import Mqtt
+
+        return Mqtt(address, part)
+    from heliograph.serving.brokers.nats import Nats
+
+    return Nats(address, part)
+
+
+class TakenOverError(InputError):
+    """Loss of the messages to another process, which reads them now."""
+
+
 async def nothing() -> None:
     """Acknowledge to a sender that expects no answer."""
 
 
 LOG = logging.getLogger("heliograph.serving")
+
 FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
@@ -101,17 +112,8 @@ class Retry:
 
 
 OFFSET, PRIME = 0x811C9DC5, 0x01000193
+
 NAMELESS = "_"  # the word for the plant that has no name
-
-
-class Part(NamedTuple):
-    """One part of the plants: its `number`, counted from 0, and the number of parts, `of`."""
-
-    number: int = 0
-    of: int = 1
-
-
-WHOLE = Part()
 
 
 def word(plant: str) -> str:
