@@ -2,7 +2,7 @@
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from math import isfinite
@@ -13,6 +13,7 @@ from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
 from heliograph.live.event import Verdict
+from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
 from heliograph.serving.lanes import Lanes, Place
@@ -33,13 +34,18 @@ class Teller:
         for place in lanes.places:
             self._nodes.setdefault(place.node, []).append(place)
 
-    def estimates(self, kind: str, plant: str, time: float | str, outputs: list[float]) -> bytes:
-        """Return a line with the estimates of all filters after a row, from the outputs of that row."""
+    def estimates(
+        self, kind: str, plant: str, time: float | str, outputs: list[float], senders: Mapping[str, SenderStatus]
+    ) -> bytes:
+        """Return a line with the estimates of all filters after a row, from its outputs, and the senders."""
         results = {
             node: {place.filter: self._filter(place, outputs) for place in places}
             for node, places in self._nodes.items()
         }
-        return line({"kind": kind, "plant": plant, "time": time, "estimates": results})
+        parts: dict[str, object] = {"kind": kind, "plant": plant, "time": time, "estimates": results}
+        if senders:
+            parts["senders"] = {name: status._asdict() | {"dead": status.dead} for name, status in senders.items()}
+        return line(parts)
 
     def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
         n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
@@ -132,6 +138,14 @@ class Service:
         lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
         self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
+
+    def dead_senders(self) -> dict[str, int]:
+        """Count the plants in memory that have a dead sender, by node whose sender decides when to send."""
+        dead = dict.fromkeys(self.fleet.deciding, 0)
+        for plant in self.plants.values() if dead else ():
+            for node, status in self.fleet.senders(plant).items():
+                dead[node] += status.dead
+        return dead
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
@@ -247,7 +261,8 @@ class Service:
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
-        return self._teller.estimates(kind, plant.name, moment, outputs)
+        senders = self.fleet.senders(plant) if kind == "provisional" else {}
+        return self._teller.estimates(kind, plant.name, moment, outputs, senders)
 
 
 @contextmanager
