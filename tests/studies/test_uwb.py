@@ -34,7 +34,7 @@ def made(seed, seconds=60.0):
     bias, quick, rows = 0.05 + 0.04 * rng.standard_normal(4), np.zeros(4), []
     for t in time:
         quick = 0.93 * quick + 0.37 * 0.04 * rng.standard_normal(4)
-        tag = place(t - LATE) + [0, 0, 1.0]
+        tag = place(t - LATE) + np.array([0, 0, 1.0])
         value = np.linalg.norm(tag - ANCHORS, axis=1) + bias + quick + 0.02 * rng.standard_normal(4)
         value -= np.where(rng.random(4) < 0.01, 5.0, 0.0)
         rows += [(t + 0.001 * i, NAMES[i], value[i], -80.0) for i in range(4) if rng.random() > 0.08]

@@ -39,8 +39,8 @@ class Numbers(NamedTuple):
     quick_time: float = 1.5
 
 
-# Before any drive: a walker changes speed by 0.3 m/s in a second; by their data sheet radios are precise to 2 to 4 cm and
-# accurate to 10 cm; stamps are late by a slot or two.
+# Before any drive: a walker changes speed by 0.3 m/s in a second; by their data sheet radios are precise to 2 to 4 cm
+# and accurate to 10 cm; stamps are late by a slot or two.
 WALK, LATE, ACCURACY = 0.1, 0.15, 0.1
 STARTS = {
     "plain": Numbers(WALK, 1.0, ACCURACY, LATE),
