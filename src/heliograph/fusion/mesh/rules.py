@@ -1,0 +1,168 @@
+"""Rules of fusion for neighbours: cheap shares of intersection, fixed shares, and best weights that were frozen."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.intersection import inverses, without_known
+from heliograph.fusion.mesh.gains import Believed, Gains, Messages, Step, correct
+from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.shares import intersection_weights, trace_shares
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import check_count, fail, scalar, table
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+SUM = 1e-9  # shares are decimal fractions, whose sum is 1 up to rounding
+
+
+class TraceIntersection(AbstractFusion):
+    """Covariance intersection with shares from the traces: proportional to (tr P_j)^-power, or equal.
+
+    Of the two the one whose fused covariance has the smaller trace: shares by trace alone ignore a neighbour of large
+    variance who alone knows some state. Nothing is searched, so it costs little on thousands of nodes.
+
+    Args:
+        power: of the traces; 4 by default.
+        improvements: steps of a multiplicative search from there towards the least trace; 0 by default.
+
+    Claim: "upper", whatever the losses, as `CovarianceIntersection`.
+
+    Source: Julier and Uhlmann (1997); Niehsen, Information fusion based on fast covariance intersection (2002).
+    """
+
+    power: float = eqx.field(static=True)
+    improvements: int = eqx.field(static=True)
+
+    def __init__(self, power: Float[ArrayLike, ""] = 4.0, improvements: int = 0):
+        self.power = float(scalar("power of the traces", power, 0.0))
+        self.improvements = check_count("improvements", improvements, 0)
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Lower the weakest claim to "upper" at most."""
+        if "none" in claims:
+            raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Intersect all of several estimates."""
+        information = inverses(covariances)
+        believed = Believed(covariances, information, None, jnp.ones(len(means), dtype=bool))
+        weights, covariance = self.neighbour_weights(believed)
+        return means[0] + jnp.einsum("jab,jb->a", weights, means - means[0]), without_known(covariance, covariances)
+
+    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+        """Intersect what arrived."""
+        return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
+
+
+class DiffusionWeights(AbstractFusion):
+    """Fixed shares c_ij of the neighbours' estimates: diffusion, whose gains do not depend on what arrives.
+
+    xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with the
+    gains K_ij and F_i of a filter at i that receives all its neighbours' measurements and no estimate.
+
+    Args:
+        shares: c_ij of each node's neighbours by name, {"a": {"b": .3, ...}, ...}, not negative, with what is left of 1
+            for the node itself; by default equal shares of a node and all its neighbours.
+
+    Claim: "exact" between neighbours, by the joint covariance of all errors; a fusion centre cannot use it.
+
+    Raises:
+        ValueError: negative shares, or a node whose shares sum to more than one.
+
+    Source: Cattivelli and Sayed, Diffusion strategies for distributed Kalman filtering and smoothing (2010).
+    """
+
+    shares: Float[Array, "..."] | None
+    given: dict[str, dict[str, float]] | None
+
+    def __init__(self, shares: Mapping[str, Mapping[str, float]] | None = None):
+        self.shares, self.given = None, None
+        if shares is not None:
+            rows = table("diffusion shares", shares, "shares by neighbour")
+            self.given = {name: _checked(name, row) for name, row in rows.items()}
+
+    @property
+    def needs_joint(self) -> bool:
+        """Always True: the claim is the joint covariance's."""
+        return True
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: a fusion centre has no neighbours."""
+        raise fail("fusion by DiffusionWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+
+    def placed(self, graph: Graph) -> "DiffusionWeights":
+        """Return the rule with its shares in the rows of the graph, zero for the node itself."""
+        result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
+        if self.given is not None:
+            result = np.array([self._row(graph, i) for i in range(len(graph.nodes))])
+        result[:, 0] = 0.0
+        return eqx.tree_at(lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None)
+
+    def _row(self, graph: Graph, i: int) -> list[float]:
+        """Shares of node i in the graph's order."""
+        given = self.given or {}
+        name, mine = graph.nodes[i], dict(given.get(graph.nodes[i], {}))
+        mine.pop(name, None)
+        names = [graph.nodes[j] for j in graph.senders[i]]
+        known = {n for n, there in zip(names, graph.present[i], strict=True) if there}
+        if unknown := sorted(set(mine) - known):
+            raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(known - {name})}", unknown)
+        return [mine.get(n, 0.0) if there else 0.0 for n, there in zip(names, graph.present[i], strict=True)]
+
+    def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
+        """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
+        a = jnp.asarray(step.matrix)
+        predicted = symmetrize(a @ believed.covariance[0] @ a.T + step.noise)
+        corrected, innovation = correct(predicted, jnp.asarray(step.complete))
+        assert self.shares is not None
+        shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
+        transition = shares[:, None, None] * (innovation @ a)
+        # What is not lost alone corrects.
+        used = jnp.eye(len(a)) - corrected @ step.arrived
+        return Gains(transition, corrected, used, corrected)
+
+
+class FrozenWeights(AbstractFusion):
+    """Best weights for joint covariances of each neighbourhood that do not move: means over losses, once settled in.
+
+    `freeze` makes it. Weights are solved for what arrived at each step, from these blocks alone.
+
+    Args:
+        rule: the rule of best weights.
+        blocks: joint covariances (node, degree, n, degree, n) of each node and its neighbours, itself first.
+
+    Claim: "nominal": the blocks are means over drawn losses, of the steady state.
+    """
+
+    rule: AbstractFusion
+    blocks: Float[Array, "..."]
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: a fusion centre has no neighbours."""
+        raise fail("fusion by FrozenWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+
+    def placed(self, graph: Graph) -> "FrozenWeights":
+        """Return the rule itself, unless its blocks are those of another graph."""
+        if np.shape(self.blocks)[:2] != graph.senders.shape:
+            raise fail("frozen weights", f"blocks (node, degree, ...) of {graph.senders.shape}", np.shape(self.blocks))
+        return self
+
+    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+        """Weights of what arrived, and the covariance that the blocks give them."""
+        return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
+
+
+def _checked(name: str, row: object) -> dict[str, float]:
+    """Shares of one node: not negative, at most one in sum, and one where its own is among them."""
+    what = f"diffusion shares of {name!r}"
+    mine = {n: float(scalar(what, share, 0.0)) for n, share in table(what, row, "shares by neighbour").items()}
+    total = sum(mine.values())
+    if total > 1 + SUM or (name in mine and total < 1 - SUM):
+        raise fail(what, "shares that sum to 1", f"{total:g}")
+    return mine
