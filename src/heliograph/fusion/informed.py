@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
-from heliograph.fusion.mesh.gains import Believed, Messages
+from heliograph.fusion.mesh.gains import Believed, Weights
 from heliograph.fusion.mesh.weights import arrived_scalar_weights, arrived_weights, arrived_weights_by_component
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
@@ -86,12 +86,12 @@ class AbstractWeights(AbstractInformedFusion):
         """Compute W from P for those estimates that are present, zero for the others."""
         raise NotImplementedError
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+    def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         chosen = self.arrived(believed.joint, believed.present)
-        return jnp.swapaxes(chosen, 0, 1), weighted(chosen, believed.joint)
+        return Weights(jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weighted(chosen, believed.joint))
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Weight the present estimates."""

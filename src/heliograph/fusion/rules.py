@@ -14,7 +14,7 @@ from heliograph.fusion.intersection import (
     trace_optimal_weights,
     without_known,
 )
-from heliograph.fusion.mesh.gains import Believed, Gains, Messages, Step, gains_of
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
 from heliograph.fusion.mesh.shares import equal_shares, intersection_weights, trace_shares
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
@@ -77,14 +77,14 @@ class AbstractFusion(Module):
         """Return the rule with what differs between the nodes of a graph along a leading axis of every array."""
         return self
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
-        """Weights C_j (degree, n, n) of the neighbours' estimates that arrived, and the fused covariance (n, n)."""
+    def neighbour_weights(self, believed: Believed) -> Weights:
+        """Weights of the neighbours' estimates that arrived, and the covariance of what is fused."""
         raise fail("fusion between neighbours", "a rule such as CovarianceIntersection() or MatrixWeights()",
                    type(self).__name__)  # fmt: skip
 
     def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
         """Gains of one node's step: fuse what was believed, predict once, correct with what was measured."""
-        return gains_of(*self.neighbour_weights(believed), step)
+        return gains_of(self.neighbour_weights(believed), step)
 
 
 def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] = ()) -> Estimate:
@@ -147,7 +147,7 @@ class CovarianceIntersection(AbstractFusion):
         information = inverses(covariances)
         return _intersection(means, covariances, information, trace_optimal_weights(information))
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+    def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect with shares that are nearly those of least trace: a few improvements of `TraceIntersection`."""
         return intersection_weights(believed, trace_shares(believed, POWER, IMPROVEMENTS))
 
@@ -167,7 +167,7 @@ class EqualIntersection(AbstractFusion):
         count = means.shape[0]
         return _intersection(means, covariances, inverses(covariances), jnp.full(count, 1 / count))
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+    def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect with equal shares of what arrived."""
         return intersection_weights(believed, equal_shares(believed))
 

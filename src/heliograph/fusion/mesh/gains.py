@@ -1,6 +1,7 @@
 """One step of a node that estimates from what arrived: weights of the estimates, then prediction and correction.
 
-With the estimates xhat_j of the step before and the measurements z_j of this one, sums over what arrived, itself included:
+With the estimates xhat_j of the step before and the measurements z_j of this one; sums over what arrived, the node's
+own included:
 
   fused      xc = sum_j C_j xhat_j,  sum_j C_j = I,  of covariance Pc
   predicted  A xc + b,  Pb = A Pc A' + Q
@@ -20,20 +21,30 @@ from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import add, identity, root, solve, symmetric, times, transpose
 from heliograph.numerics.types import Array, Bool, Float
 
-Messages = Float[jax.Array, "degree n n"]
-
 
 class Believed(NamedTuple):
     """Knowledge of one node about the estimates that its neighbours sent, itself first, and which of them arrived.
 
-    Shapes: covariance and information (degree, n, n), its inverse; joint (degree, n, degree, n), None where it is not
-    propagated; present (degree,).
+    Shapes: covariance (n, n) of the node itself; traces (degree,) of all covariances, information (degree, n, n), their
+    inverses; joint (degree, n, degree, n), None where it is not propagated; present (degree,).
     """
 
-    covariance: Float[jax.Array, "degree n n"]
+    covariance: Float[jax.Array, "n n"]
+    traces: Float[jax.Array, " degree"]
     information: Float[jax.Array, "degree n n"]
     joint: Float[jax.Array, "degree n degree n"] | None
     present: Bool[jax.Array, " degree"]
+
+
+class Weights(NamedTuple):
+    """Weights C_j = front parts_j of the neighbours' estimates, and the covariance Pc of what is fused.
+
+    Shapes: front (n, n), parts (degree, n, n), covariance (n, n). Two factors, since intersections share the first.
+    """
+
+    front: Float[jax.Array, "n n"]
+    parts: Float[jax.Array, "degree n n"]
+    covariance: Float[jax.Array, "n n"]
 
 
 class Step(NamedTuple):
@@ -46,21 +57,24 @@ class Step(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Gains of one node's step: M_j (degree, n, n), zero for itself; W and F = I - W S (n, n); P (n, n)."""
+    """Gains of one node's step: M_j = front parts_j, of others than itself; W and F = I - W S; P.
 
-    transition: Float[jax.Array, "degree n n"]
+    Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n).
+    """
+
+    front: Float[jax.Array, "n n"]
+    parts: Float[jax.Array, "degree n n"]
     gain: Float[jax.Array, "n n"]
     innovation: Float[jax.Array, "n n"]
     covariance: Float[jax.Array, "n n"]
 
 
-def gains_of(weights: Float[jax.Array, "degree n n"], covariance: Float[jax.Array, "n n"], step: Step) -> Gains:
-    """Gains of the step with these weights C_j of the estimates, whose fused covariance is `covariance`."""
+def gains_of(weights: Weights, step: Step) -> Gains:
+    """Gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
     a = jnp.asarray(step.matrix)
-    predicted = symmetrize(a @ covariance @ a.T + step.noise)
+    predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
     corrected, innovation = correct(predicted, jnp.asarray(step.arrived))
-    transition = (innovation @ a) @ weights
-    return Gains(transition.at[0].set(0.0), corrected, innovation, corrected)
+    return Gains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
 
 
 @runs_last

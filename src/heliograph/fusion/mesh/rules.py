@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.intersection import inverses, without_known
-from heliograph.fusion.mesh.gains import Believed, Gains, Messages, Step, correct
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.mesh.shares import intersection_weights, trace_shares
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
@@ -51,11 +50,13 @@ class TraceIntersection(AbstractFusion):
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Intersect all of several estimates."""
         information = inverses(covariances)
-        believed = Believed(covariances, information, None, jnp.ones(len(means), dtype=bool))
-        weights, covariance = self.neighbour_weights(believed)
-        return means[0] + jnp.einsum("jab,jb->a", weights, means - means[0]), without_known(covariance, covariances)
+        traces = jnp.trace(covariances, axis1=1, axis2=2)
+        believed = Believed(covariances[0], traces, information, None, jnp.ones(len(means), dtype=bool))
+        front, parts, covariance = self.neighbour_weights(believed)
+        off = jnp.einsum("jab,jb->a", parts, means - means[0])
+        return means[0] + front @ off, without_known(covariance, covariances)
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+    def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect what arrived."""
         return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
 
@@ -63,8 +64,8 @@ class TraceIntersection(AbstractFusion):
 class DiffusionWeights(AbstractFusion):
     """Fixed shares c_ij of the neighbours' estimates: diffusion, whose gains do not depend on what arrives.
 
-    xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with the
-    gains K_ij and F_i of a filter at i that receives all its neighbours' measurements and no estimate.
+    xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with
+    the gains K_ij and F_i of a filter at i that receives all its neighbours' measurements and no estimate.
 
     Args:
         shares: c_ij of each node's neighbours by name, {"a": {"b": .3, ...}, ...}, not negative, with what is left of 1
@@ -118,18 +119,17 @@ class DiffusionWeights(AbstractFusion):
     def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
         """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
         a = jnp.asarray(step.matrix)
-        predicted = symmetrize(a @ believed.covariance[0] @ a.T + step.noise)
+        predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
         corrected, innovation = correct(predicted, jnp.asarray(step.complete))
         assert self.shares is not None
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
-        transition = shares[:, None, None] * (innovation @ a)
-        # What is not lost alone corrects.
+        # What arrived alone corrects.
         used = jnp.eye(len(a)) - corrected @ step.arrived
-        return Gains(transition, corrected, used, corrected)
+        return Gains(innovation @ a, shares[:, None, None] * jnp.eye(len(a)), corrected, used, corrected)
 
 
 class FrozenWeights(AbstractFusion):
-    """Best weights for joint covariances of each neighbourhood that do not move: means over losses, once settled in.
+    """Best weights for joint covariances of each neighbourhood that do not move: means over losses in the steady state.
 
     `freeze` makes it. Weights are solved for what arrived at each step, from these blocks alone.
 
@@ -153,7 +153,7 @@ class FrozenWeights(AbstractFusion):
             raise fail("frozen weights", f"blocks (node, degree, ...) of {graph.senders.shape}", np.shape(self.blocks))
         return self
 
-    def neighbour_weights(self, believed: Believed) -> tuple[Messages, Float[jax.Array, "n n"]]:
+    def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of what arrived, and the covariance that the blocks give them."""
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
 

@@ -10,23 +10,24 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
 from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights
 from heliograph.fusion.mesh.graph import graph_of
-from heliograph.fusion.rules import AbstractFusion, Fusion
+from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, solve, times, times_vector, transpose
+from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
 from heliograph.numerics.types import Bool, Float
 from heliograph.simulation.centres.centre import Listening, listening
 from heliograph.simulation.centres.edges import Edges, edges_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-
+DENSE = 200  # nodes whose joint covariance is propagated at every step
 Arrived = Bool[jax.Array, "node rounds degree"]  # which messages arrived, each node's from itself first
 
 
@@ -44,13 +45,30 @@ class MeshState(NamedTuple):
 
 
 class Data(NamedTuple):
-    """Messages about one step's measurements: S_j = H_j' R_j^-1 H_j and H_j' R_j^-1 (z_j - H_j x) about a common x.
+    """Measurement models of one step: H_j' R_j^-1 (node, n, m) and S_j = H_j' R_j^-1 H_j (node, n, n) of what is there.
 
-    Shapes: information (node, n, n), innovation (node, n).
+    `complete`: S_j if no component were missing.
     """
 
+    observation: Observation
+    weighted: Float[jax.Array, "node n m"]
     information: Float[jax.Array, "node n n"]
-    innovation: Float[jax.Array, "node n"]
+    complete: Float[jax.Array, "node n n"]
+
+
+class Parts(NamedTuple):
+    """One step of all nodes without the estimates, which enter none of it.
+
+    exchanges: weights of every round but the last. Shapes: information (node, n, n) that each node has
+    learned; plant: moments of the state after the step.
+    """
+
+    motion: Motion
+    plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+    exchanges: tuple[Weights, ...]
+    data: Data
+    information: Float[jax.Array, "node n n"]
+    gains: Gains
 
 
 class Mesh(Module):
@@ -85,43 +103,74 @@ class Mesh(Module):
         u: jax.Array, k: jax.Array,
     ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
         """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes."""
-        # Plant and measurement models of this step.
+        blocks = self.blocks(state.joint)
+        there = jnp.concatenate([self._rows(part) for part in z])[self.order]
+        parts = self.parts(state.covariance, blocks, state.plant, ~jnp.isnan(there), arrived, u, k)
+        gains, motion = parts.gains, parts.motion
+        # All rounds but the last only intersect.
+        mean = state.mean
+        for weights in parts.exchanges:
+            mean = mean + self._pulled(weights.front, weights.parts, mean)
+        # Innovations about one common prediction, so that no digits of the means themselves are lost.
+        predicted = mean @ motion.matrix.T + motion.shift
+        common = jnp.mean(predicted, axis=0)
+        observation = parts.data.observation
+        off = jnp.where(jnp.isnan(there), 0.0, there - observation.offset - observation.gain @ common)
+        sums = self._collected(jnp.einsum("inm,im->in", parts.data.weighted, off), arrived)
+        # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
+        innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
+        mean = (
+            predicted + self._pulled(gains.front, gains.parts, mean) + jnp.einsum("iab,ib->ia", gains.gain, innovation)
+        )
+        # Covariance of all errors where the rule needs it; it is then what is claimed.
+        joint = None if state.joint is None else self._moved(state.joint, parts, arrived[:, -1])
+        claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
+        after = MeshState(mean, gains.covariance, joint, parts.plant)
+        return after, self._by_group(mean, claimed)
+
+    def parts(
+        self,
+        covariance: Float[jax.Array, "node n n"],
+        blocks: Float[jax.Array, "node degree n degree n"] | None,
+        moments: tuple[jax.Array, jax.Array],
+        there: Bool[jax.Array, "node m"],
+        arrived: Arrived,
+        u: jax.Array,
+        k: jax.Array,
+    ) -> Parts:
+        """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
         plant: LinearPlant = at(self.plant, k)
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
-        moments = moved_state(*state.plant, motion)
-        # All rounds but the last only intersect.
-        mean, covariance = state.mean, state.covariance
+        moments = moved_state(*moments, motion)
+        exchanges = []
         for number in range(self.edges.rounds - 1):
-            mean, covariance = self._exchanged(mean, covariance, arrived[:, number])
-        predicted = mean @ motion.matrix.T + motion.shift
-        common = jnp.mean(predicted, axis=0)
-        data, complete = self.data(z, common, moments, k)
+            exchanges.append(self._exchange(covariance, arrived[:, number]))
+            covariance = exchanges[-1].covariance
         # What each node learns of the measurements, and its gains.
-        information, innovation = self._collected(data, arrived)
-        total = self._sum_of(complete.information, jnp.asarray(self.edges.present))
-        gains = self._gains(MeshState(mean, covariance, state.joint, state.plant), arrived[:, -1], motion, information,
-                            total)  # fmt: skip
-        # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
-        others = jnp.einsum("idab,idb->ia", gains.transition, mean[self.senders] - mean[:, None])
-        off = innovation - jnp.einsum("iab,ib->ia", information, predicted - common)
-        mean = predicted + others + jnp.einsum("iab,ib->ia", gains.gain, off)
-        joint = None if state.joint is None else self._moved(state.joint, gains, motion, data, arrived[:, -1])
-        claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
-        return MeshState(mean, gains.covariance, joint, moments), self._by_group(mean, claimed)
+        data = self._data(self.observe(moments, k), there)
+        information = self._collected(data.information, arrived)
+        complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
+        gains = self.gains(covariance, blocks, arrived[:, -1], motion, information, complete)
+        return Parts(motion, moments, tuple(exchanges), data, information, gains)
 
-    def data(
-        self, z: Sequence[jax.Array], common: jax.Array, moments: tuple[jax.Array, jax.Array], k: jax.Array
-    ) -> tuple[Data, Data]:
-        """Messages about what was measured, and about what all nodes would say if no component were missing."""
-        observation = self.observe(moments, k)
-        rows = [jnp.pad(part, ((0, 0), (0, self.size - part.shape[1])), constant_values=jnp.nan) for part in z]
-        values = jnp.concatenate(rows)[self.order]
-        there = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
-        off = values - observation.offset - observation.gain @ common
-        both = [jax.vmap(_message)(observation.gain, observation.noise, jnp.where(used, off, 0.0), used)
-                for used in (there & ~jnp.isnan(values), there)]  # fmt: skip
-        return Data(*both[0]), Data(*both[1])
+    def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
+        """Measurements of a group, filled with NaN up to the longest."""
+        return jnp.pad(z, ((0, 0), (0, self.size - z.shape[1])), constant_values=jnp.nan)
+
+    def _pulled(
+        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n n"], mean: jax.Array
+    ) -> Float[jax.Array, "node n"]:
+        """front_i sum_j parts_ij (xhat_j - xhat_i)."""
+        off = jnp.einsum("idab,idb->ia", parts, mean[self.senders] - mean[:, None])
+        return jnp.einsum("iab,ib->ia", front, off)
+
+    def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
+        """Messages about what was measured, and about what would be if no component were missing."""
+        real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
+        weighted, information = jax.vmap(_message)(observation.gain, observation.noise, real & there)
+        complete = jax.vmap(_message)(observation.gain, observation.noise, real)[1]
+        return Data(observation, weighted, information, complete)
 
     def observe(self, moments: tuple[jax.Array, jax.Array], k: jax.Array) -> Observation:
         """Measurement models of all nodes at step k, rows of zeros where a node has none."""
@@ -133,59 +182,71 @@ class Mesh(Module):
             parts.append(none if group is None else group.observe(*moments, k, self.size))
         return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
-    def _exchanged(self, mean: jax.Array, covariance: jax.Array, present: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Intersect once with the neighbours' estimates."""
+    def _exchange(self, covariance: jax.Array, present: jax.Array) -> Weights:
+        """Weights of an exchange that only intersects, with the covariances after it."""
         believed = self._believed(covariance, None, present)
-        weights, fused = eqx.filter_vmap(lambda rule, item: rule.neighbour_weights(item),
-                                         in_axes=(eqx.if_array(0), 0))(self.rule, believed)  # fmt: skip
-        return mean + jnp.einsum("idab,idb->ia", weights, mean[self.senders] - mean[:, None]), fused
+        both = eqx.filter_vmap(lambda rule, item: rule.neighbour_weights(item), in_axes=(eqx.if_array(0), 0))
+        result: Weights = both(self.rule, believed)
+        return result
 
-    def _believed(self, covariance: jax.Array, joint: jax.Array | None, present: jax.Array) -> Believed:
+    def blocks(self, joint: jax.Array | None) -> jax.Array | None:
+        """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+        if joint is None:
+            return None
+        rows, columns = self.senders[:, :, None], self.senders[:, None]
+        return jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
+
+    def _believed(self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array) -> Believed:
         information = jax.vmap(inverse)(covariance)
-        block = None
-        if joint is not None:
-            rows, columns = self.senders[:, :, None], self.senders[:, None]
-            block = jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
-        return Believed(covariance[self.senders], information[self.senders], block, present)
+        traces = jnp.trace(covariance, axis1=1, axis2=2)
+        mine, theirs = self.senders[:, 0], self.senders
+        return Believed(covariance[mine], traces[theirs], information[theirs], blocks, present)
 
-    def _collected(self, data: Data, arrived: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Sums of the measurements' messages that each node has after all rounds, each counted once."""
+    def _collected(self, values: jax.Array, arrived: jax.Array) -> jax.Array:
+        """Sums of the nodes' messages that each node has after all rounds, each counted once."""
         if self.edges.rounds == 1:
-            return self._sum_of(data.information, arrived[:, 0]), self._sum_of(data.innovation, arrived[:, 0])
+            return self.sum_of(values, arrived[:, 0])
+        return jnp.tensordot(self.known(arrived).astype(values.dtype), values, 1)
+
+    def known(self, arrived: jax.Array) -> Bool[jax.Array, "node node"]:
+        """Test whose measurements each node has after all rounds."""
         known = jnp.eye(len(self.senders), dtype=bool)
         for number in range(self.edges.rounds):
             known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
-        counted = known.astype(data.innovation.dtype)
-        return jnp.tensordot(counted, data.information, 1), counted @ data.innovation
+        return known
 
-    def _sum_of(self, values: jax.Array, present: jax.Array) -> jax.Array:
+    def sum_of(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Sum over what arrived of values by node."""
         result: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
         return result
 
-    def _gains(
-        self, state: MeshState, present: jax.Array, motion: Motion, information: jax.Array, complete: jax.Array
+    def gains(
+        self,
+        covariance: jax.Array,
+        blocks: jax.Array | None,
+        present: jax.Array,
+        motion: Motion,
+        information: jax.Array,
+        complete: jax.Array,
     ) -> Gains:
         """Gains of all nodes."""
-        believed = self._believed(state.covariance, state.joint, present)
+        believed = self._believed(covariance, blocks, present)
 
-        def single(rule: AbstractFusion, item: Believed, arrived: jax.Array, all_of_them: jax.Array) -> Gains:
-            return rule.neighbour_gains(item, Step(motion.matrix, motion.noise, arrived, all_of_them))
+        def single(rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array) -> Gains:
+            return rule.neighbour_gains(item, Step(motion.matrix, motion.noise, arrived, every))
 
         both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0, 0))
         result: Gains = both(self.rule, believed, information, complete)
         return result
 
-    def _moved(
-        self, joint: jax.Array, gains: Gains, motion: Motion, data: Data, present: jax.Array
-    ) -> Float[jax.Array, "node n node n"]:
+    def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
         """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
+        gains, motion = parts.gains, parts.motion
         nodes, n = len(self.senders), len(motion.shift)
-        itself = gains.innovation @ motion.matrix - gains.transition.sum(axis=1)
-        m = self._spread(gains.transition.at[:, 0].set(itself))
+        m = self._spread(transitions(gains, motion))
         k = self._spread(jnp.where(present[:, :, None, None], gains.gain[:, None], 0.0))
         f = gains.innovation.reshape(nodes * n, n)
-        weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), data.information).reshape(k.shape)
+        weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), parts.data.information).reshape(k.shape)
         result = m @ joint.reshape(m.shape) @ m.T + f @ motion.noise @ f.T + weighted @ k.T
         return symmetrize(result).reshape(nodes, n, nodes, n)
 
@@ -204,16 +265,22 @@ class Mesh(Module):
         )
 
 
+def transitions(gains: Gains, motion: Motion) -> Float[jax.Array, "node degree n n"]:
+    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
+    others = (gains.front[:, None] @ gains.parts).at[:, 0].set(0.0)
+    return others.at[:, 0].set(gains.innovation @ motion.matrix - others.sum(axis=1))
+
+
 @runs_last
 def _message(
-    gain: jax.Array, noise: jax.Array, off: jax.Array, used: jax.Array
-) -> tuple[Float[jax.Array, "n n *#runs"], Float[jax.Array, "n *#runs"]]:
-    """S = H' R^-1 H and H' R^-1 off of the components that are used."""
+    gain: jax.Array, noise: jax.Array, used: jax.Array
+) -> tuple[Float[jax.Array, "n m *#runs"], Float[jax.Array, "n n *#runs"]]:
+    """H' R^-1 and H' R^-1 H of the components that are used."""
     there = used.astype(gain.dtype)
     h = there[:, None] * gain
     r = there[:, None] * noise * there[None] + diagonal(1 - there)
     weighted = transpose(solve(r, h))
-    return times(weighted, h), times_vector(weighted, off)
+    return weighted, times(weighted, h)
 
 
 def mesh_of(network: Network, name: str) -> Mesh:
@@ -248,5 +315,15 @@ def mesh_of(network: Network, name: str) -> Mesh:
 
 
 def meshes_of(network: Network) -> dict[str, Mesh]:
-    """Fusions between neighbours, by name."""
+    """Fusions between neighbours, by name, to be stepped.
+
+    Raises:
+        ValueError: too many nodes for a rule that follows the joint covariance of their errors.
+    """
+    for name, item in network.meshes.items():
+        nodes = len(network.mesh_nodes(name))
+        if item.rule.needs_joint and nodes > DENSE:
+            kind = type(item.rule).__name__
+            expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
+            raise fail(f"fusion {name!r} between neighbours by {kind}", expected, nodes)
     return {name: mesh_of(network, name) for name in network.meshes}

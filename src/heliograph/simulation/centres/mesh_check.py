@@ -20,7 +20,6 @@ from heliograph.simulation.node import Node
 if TYPE_CHECKING:
     from heliograph.simulation.network import Network
 
-DENSE = 200  # nodes whose joint covariance is propagated at every step
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
 RANK = 1e-9  # relative: singular values of a mode's observability below are zero
 
@@ -48,7 +47,7 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
             raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(item.filters) or "none")
         if name in item.filters:
             raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
-    _check_rule(what, fusion, network, len(network.mesh_nodes(name)))
+    _check_rule(what, fusion, network)
     for link in {id(item): item for item in _links(fusion)}.values():
         check_edge(link)
     graph = graph_of(neighbours, network.mesh_nodes(name))
@@ -79,7 +78,7 @@ def _links(fusion: Fusion) -> list[object]:
     return list(fusion.link.values()) if isinstance(fusion.link, dict) else [fusion.link]
 
 
-def _check_rule(what: str, fusion: Fusion, network: "Network", nodes: int) -> None:
+def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
     """Refuse a rule without weights for neighbours, more than it can do, and a start that has no inverse."""
     rule, kind = fusion.rule, type(fusion.rule)
     if not rule.between_neighbours:
@@ -88,9 +87,6 @@ def _check_rule(what: str, fusion: Fusion, network: "Network", nodes: int) -> No
         raise fail(f"{what} by {kind.__name__}", "with_mean=False", True)
     if fusion.rounds > 1 and (rule.needs_joint or isinstance(rule, FrozenWeights)):
         raise fail(f"{what} by {kind.__name__}", "one round (more need a rule that intersects)", fusion.rounds)
-    if rule.needs_joint and nodes > DENSE:
-        expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
-        raise fail(f"{what} by {kind.__name__}", expected, nodes)
     start = np.asarray(first(network.plant).initial_covariance)
     scale = np.sqrt(np.diagonal(start))
     singular = np.any(scale == 0) or np.linalg.eigvalsh(start / np.outer(scale, scale))[0] < RANK
@@ -129,8 +125,10 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
         for unstable in known[id(places)]:
             unseen[unstable].append(nodes[i])
     if unseen[True]:
-        raise fail(what, "that a node or one upstream of it observes every mode that does not decay",
-                   f"none for {', '.join(map(repr, unseen[True][:5]))}{' and more' * (len(unseen[True]) > 5)}")  # fmt: skip
+        some = ", ".join(map(repr, unseen[True][:5])) + (" and more" if len(unseen[True]) > 5 else "")
+        raise fail(
+            what, "that a node or one upstream of it observes every mode that does not decay", f"none for {some}"
+        )
     if unseen[False]:
         warnings.warn(f"{what}: a decaying mode is observed by nobody upstream of {unseen[False][:5]}; their errors "
                       "are those of its prior", stacklevel=4)  # fmt: skip
