@@ -74,7 +74,7 @@ class AbstractFusion(Module):
         return False
 
     def placed(self, graph: Graph) -> "AbstractFusion":
-        """Return the rule with what differs between the nodes of a graph along a leading axis of every array."""
+        """Return the rule with what differs between the rows of a graph along a leading axis of every array."""
         return self
 
     def neighbour_weights(self, believed: Believed) -> Weights:

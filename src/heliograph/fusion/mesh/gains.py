@@ -88,9 +88,9 @@ def correct(
     n = predicted.shape[0]
     left = root(information)
     cross = times(predicted, left)
-    inner = identity(n, predicted) + symmetric(times(transpose(left), cross))
+    inner = jnp.asarray(identity(n, predicted)) + symmetric(times(transpose(left), cross))
     short = predicted - times(cross, solve(inner, transpose(cross)))
-    innovation = identity(n, predicted) - times(short, information)
+    innovation = jnp.asarray(identity(n, predicted)) - times(short, information)
     pushed = times(short, left)
     long = add([times(times(innovation, predicted), transpose(innovation)), times(pushed, transpose(pushed))])
     return symmetric(long), innovation

@@ -25,11 +25,15 @@ class GraphLike(Protocol):
         """Test whether a pair is one way."""
 
 
+FEW = 64  # nodes whose rows stay together
+PARTS = (0.4, 0.75, 0.95, 1.0)  # shares of the nodes up to the longest row of each part
 Neighbours = Mapping[str, Sequence[str]] | GraphLike
 
 
 class Graph(NamedTuple):
     """Neighbours by place, in rows of one length: each node itself, those it receives, then itself again as padding.
+
+    There is a row for each of the nodes, or for some of them.
 
     Shapes: senders (node, degree), present (node, degree): False for padding.
     """
@@ -43,6 +47,20 @@ class Graph(NamedTuple):
         """Places of sender and receiver of every edge, receiver after receiver; a node itself is none."""
         receiver, column = np.nonzero(self.present[:, 1:])
         return np.stack([self.senders[receiver, column + 1], receiver], axis=1)
+
+    def buckets(self) -> "list[Graph]":
+        """Return parts of the rows, few neighbours first, without the padding that these do not need.
+
+        Arithmetic on a row costs by its length, up to its cube, and a graph's longest rows are few.
+        """
+        counts = self.present.sum(axis=1)
+        widths = {int(w) for w in np.quantile(counts, PARTS, method="higher")} if len(counts) > FEW else {counts.max()}
+        parts, least = [], 0
+        for width in sorted(widths):
+            rows = np.flatnonzero((counts > least) & (counts <= width))
+            parts.append(Graph(self.nodes, self.senders[rows, :width], self.present[rows, :width]))
+            least = width
+        return parts
 
     def reach(self) -> csr_array:
         """Matrix (node, node) with a one where a node receives another, itself included."""

@@ -101,15 +101,15 @@ class DiffusionWeights(AbstractFusion):
         """Return the rule with its shares in the rows of the graph, zero for the node itself."""
         result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
         if self.given is not None:
-            result = np.array([self._row(graph, i) for i in range(len(graph.nodes))])
+            result = np.array([self._row(graph, i) for i in range(len(graph.senders))])
         result[:, 0] = 0.0
         return eqx.tree_at(lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None)
 
     def _row(self, graph: Graph, i: int) -> list[float]:
         """Shares of node i in the graph's order."""
         given = self.given or {}
-        name, mine = graph.nodes[i], dict(given.get(graph.nodes[i], {}))
-        mine.pop(name, None)
+        name = graph.nodes[graph.senders[i, 0]]
+        mine = {n: share for n, share in given.get(name, {}).items() if n != name}
         names = [graph.nodes[j] for j in graph.senders[i]]
         known = {n for n, there in zip(names, graph.present[i], strict=True) if there}
         if unknown := sorted(set(mine) - known):
@@ -148,10 +148,12 @@ class FrozenWeights(AbstractFusion):
         raise fail("fusion by FrozenWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
     def placed(self, graph: Graph) -> "FrozenWeights":
-        """Return the rule itself, unless its blocks are those of another graph."""
-        if np.shape(self.blocks)[:2] != graph.senders.shape:
-            raise fail("frozen weights", f"blocks (node, degree, ...) of {graph.senders.shape}", np.shape(self.blocks))
-        return self
+        """Return the rule with the blocks of the graph's rows."""
+        width = graph.senders.shape[1]
+        if len(self.blocks) != len(graph.nodes) or np.shape(self.blocks)[1] < width:
+            raise fail("frozen weights", f"blocks of {len(graph.nodes)} nodes and {width} of each or more",
+                       f"shape {np.shape(self.blocks)}")  # fmt: skip
+        return FrozenWeights(self.rule, np.asarray(self.blocks)[graph.senders[:, 0], :width, :, :width])
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of what arrived, and the covariance that the blocks give them."""

@@ -5,8 +5,11 @@ import jax.numpy as jnp
 
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.linalg import regular_solve
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import factor, minus
 from heliograph.numerics.types import Bool, Float
 
+SHORT = 24  # unknowns of equations that are solved side by side, operation by operation
 RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have on top of its own
 
 
@@ -29,9 +32,25 @@ def arrived_weights(
     total = scaled + jnp.diag(jnp.repeat(jnp.where(present, RIDGE, 1.0), n))
     ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
-    solved = regular_solve(total, ones)
+    solved = _short_solve(total, ones) if degree * n <= SHORT else regular_solve(total, ones)
     weights = (inverse(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
+
+
+@runs_last
+def _short_solve(
+    a: Float[jax.Array, "n n *#runs"], b: Float[jax.Array, "n k *#runs"]
+) -> Float[jax.Array, "n k *#runs"]:
+    """A^-1 B of a regular A by its Cholesky factor, written out."""
+    columns, scales = factor(a)
+    n = len(a)
+    forward: list[jax.Array] = []
+    for i in range(n):  # L Y = B
+        forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
+    backward = forward[:]
+    for i in reversed(range(n)):  # L' X = Y
+        backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
+    return jnp.stack(backward)
 
 
 def arrived_weights_by_component(

@@ -1,6 +1,6 @@
 """Fusion between neighbours inside a step: every node fuses what arrived, predicts once, and corrects."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
-from heliograph.numerics.types import Bool, Float
+from heliograph.numerics.types import Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Listening, listening
 from heliograph.simulation.centres.edges import Edges, edges_of
 from heliograph.simulation.network import Network
@@ -71,15 +71,23 @@ class Parts(NamedTuple):
     gains: Gains
 
 
+class Rows(Module):
+    """Some nodes of a mesh, of about as many neighbours, and the rule placed on them."""
+
+    rule: AbstractFusion
+    rows: np.ndarray
+    width: int = eqx.field(static=True)
+
+
 class Mesh(Module):
-    """A fusion between neighbours: the graph, its edges, the rule placed on it, and models of the measurements.
+    """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
 
     `groups`: models of the measurements of the network's groups of nodes, None for nodes without a sensor; `order`
     brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again.
     """
 
     plant: AnyPlant
-    rule: AbstractFusion
+    buckets: tuple[Rows, ...]
     edges: Edges
     groups: tuple[Listening | None, ...]
     senders: np.ndarray
@@ -88,6 +96,7 @@ class Mesh(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
+    needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
     def init(self) -> MeshState:
@@ -95,7 +104,7 @@ class Mesh(Module):
         plant = at(self.plant, 0)
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
-        joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.rule.needs_joint else None
+        joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
         return MeshState(jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1)), joint, (mean, covariance))
 
     def step(
@@ -184,9 +193,7 @@ class Mesh(Module):
 
     def _exchange(self, covariance: jax.Array, present: jax.Array) -> Weights:
         """Weights of an exchange that only intersects, with the covariances after it."""
-        believed = self._believed(covariance, None, present)
-        both = eqx.filter_vmap(lambda rule, item: rule.neighbour_weights(item), in_axes=(eqx.if_array(0), 0))
-        result: Weights = both(self.rule, believed)
+        result: Weights = self._over_nodes(lambda rule, item: rule.neighbour_weights(item), covariance, None, present)
         return result
 
     def blocks(self, joint: jax.Array | None) -> jax.Array | None:
@@ -196,11 +203,30 @@ class Mesh(Module):
         rows, columns = self.senders[:, :, None], self.senders[:, None]
         return jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
 
-    def _believed(self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array) -> Believed:
-        information = jax.vmap(inverse)(covariance)
-        traces = jnp.trace(covariance, axis1=1, axis2=2)
-        mine, theirs = self.senders[:, 0], self.senders
-        return Believed(covariance[mine], traces[theirs], information[theirs], blocks, present)
+    def _over_nodes(
+        self,
+        function: Callable[..., PyTree],
+        covariance: jax.Array,
+        blocks: jax.Array | None,
+        present: jax.Array,
+        *rest: jax.Array,
+    ) -> PyTree:
+        """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
+        information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
+        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), *[0] * (1 + len(rest))))
+        results = []
+        for part in self.buckets:
+            rows, width = part.rows, part.width
+            theirs = self.senders[rows, :width]
+            block = None if blocks is None else blocks[rows, :width, :, :width]
+            item = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
+            results.append(both(part.rule, item, *(leaf[rows] for leaf in rest)))
+        if len(results) == 1:
+            return results[0]
+        # Rows of one length again, in the order of the nodes.
+        degree, order = self.senders.shape[1], np.argsort(np.concatenate([part.rows for part in self.buckets]))
+        padded = [r._replace(parts=_padded(r.parts, degree)) for r in results]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *padded)
 
     def _collected(self, values: jax.Array, arrived: jax.Array) -> jax.Array:
         """Sums of the nodes' messages that each node has after all rounds, each counted once."""
@@ -230,13 +256,11 @@ class Mesh(Module):
         complete: jax.Array,
     ) -> Gains:
         """Gains of all nodes."""
-        believed = self._believed(covariance, blocks, present)
 
         def single(rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array) -> Gains:
             return rule.neighbour_gains(item, Step(motion.matrix, motion.noise, arrived, every))
 
-        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0, 0))
-        result: Gains = both(self.rule, believed, information, complete)
+        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete)
         return result
 
     def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
@@ -263,6 +287,11 @@ class Mesh(Module):
         return tuple(
             Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
         )
+
+
+def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n n"]:
+    """Fill rows with zeros up to the longest."""
+    return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), (0, 0), (0, 0)))
 
 
 def transitions(gains: Gains, motion: Motion) -> Float[jax.Array, "node degree n n"]:
@@ -301,7 +330,9 @@ def mesh_of(network: Network, name: str) -> Mesh:
     mine = [tuple(place[node] for node in network.groups[kind.group]) for kind in kinds]
     return Mesh(
         plant=network.plant,
-        rule=fusion.rule.placed(graph),
+        buckets=tuple(
+            Rows(fusion.rule.placed(part), part.senders[:, 0], part.senders.shape[1]) for part in graph.buckets()
+        ),
         edges=edges_of(fusion, graph),
         groups=tuple(groups),
         senders=graph.senders,
@@ -310,6 +341,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         places=tuple(mine),
         nodes=graph.nodes,
         size=max(1, *(node.received for node in network.nodes.values())),
+        needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],
     )
 

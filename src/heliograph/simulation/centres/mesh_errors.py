@@ -122,7 +122,7 @@ def errors_over_time(
     covariance, moments = start.covariance, start.plant
     nodes, n = start.mean.shape
     joint = np.tile(moments[1], (nodes, nodes))
-    follows = mesh.rule.needs_joint
+    follows = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
         blocks = blocks_of(joint, mesh.senders) if follows else None
         with jax.enable_x64(True):
@@ -254,7 +254,7 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
     lossless = mesh.edges.lossless()
     there = np.ones((len(mesh.senders), mesh.size), dtype=bool)
     blocks = None
-    if mesh.rule.needs_joint:
+    if mesh.needs_joint:
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jax.numpy.zeros((len(mesh.senders), degree, n, degree, n))
     return mesh.parts(covariance, blocks, moments, there, lossless, u, k)

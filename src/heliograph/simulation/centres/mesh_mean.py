@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from heliograph.fusion.mesh.gains import Gains
+from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
@@ -24,7 +25,7 @@ from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.erasure import Erasure
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.mesh import Mesh, Parts, transitions
+from heliograph.simulation.centres.mesh import Mesh, Parts, Rows, transitions
 from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
 from heliograph.simulation.network import Network
 
@@ -73,8 +74,10 @@ def mean_mesh_errors(
                for i in range(len(names)) for sender in (item.neighbours or {})[names[i]]]  # fmt: skip
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
-    rule = jax.tree.map(lambda leaf: leaf[patterns.node] if eqx.is_array(leaf) else leaf, mesh.rule)
-    rows = eqx.tree_at(lambda m: (m.senders, m.rule), mesh, (mesh.senders[patterns.node], rule))
+    rule = item.rule.placed(graph_of(item.neighbours or {}, names))
+    rule = jax.tree.map(lambda leaf: leaf[patterns.node] if eqx.is_array(leaf) else leaf, rule)
+    part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
