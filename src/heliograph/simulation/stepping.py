@@ -171,8 +171,10 @@ class AllFilters(Module):
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters.
         for name, mesh in self.meshes.items():
-            flags = jnp.asarray(mesh.edges.lossless() if drawn is None else drawn[name])
-            published[name], shown = mesh.step(reporting[name], z, flags, u, k)
+            flags = mesh.edges.lossless() if drawn is None else drawn[name]
+            if drawn is None and mesh.edges.groups:
+                raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
+            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Next states and results.
         local, central = tuple(state for state, _ in results), {name: state for name, (state, _) in received.items()}

@@ -117,6 +117,7 @@ def fusion(rule=None, neighbours=None, **rest):
     return hg.Fusion("own", rule or hg.CovarianceIntersection(), neighbours=neighbours or {"a": ["b"]}, **rest)
 
 
+STRANGER = {"a": {"c": 1.0}}
 SHARES = {"a": {"b": 0.7, "a": 0.7}}
 BAD = {
     "a node that is not there": (lambda: hg.Network(PLANT, {"a": node()}, {"m": fusion()}), "unknown ones"),
@@ -135,7 +136,7 @@ BAD = {
     ),
     "a negative share": (lambda: hg.fusion.DiffusionWeights({"a": {"b": -0.1}}), "a number of at least 0"),
     "a stranger's share": (
-        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(hg.fusion.DiffusionWeights({"a": {"c": 1.0}}))}),
+        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(hg.fusion.DiffusionWeights(STRANGER))}),
         "diffusion shares of 'a': expected those of its neighbours",
     ),
     "losses that nobody knows of": (
@@ -151,7 +152,8 @@ BAD = {
         "link between neighbours: expected",
     ),
     "a link that is none": (
-        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=0.8)}), "link between neighbours: expected"
+        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=0.8)}),
+        "link between neighbours: expected",
     ),
     "links of other edges": (
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link={"a to b": LINK})}),
@@ -184,7 +186,9 @@ BAD = {
     "a quantizer": (
         lambda: fusion(quantizer=hg.fusion.UniformQuantizer(4, 1.0)), "messages that arrive as they are or not at all"
     ),
-    "links without neighbours": (lambda: hg.Fusion("own", hg.CovarianceIntersection(), link=LINK), "expected neighbours"),
+    "links without neighbours": (
+        lambda: hg.Fusion("own", hg.CovarianceIntersection(), link=LINK), "expected neighbours"
+    ),
     "a name that a filter has": (
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"own": fusion()}), "expected a name that no filter has"
     ),
@@ -223,6 +227,31 @@ def test_best_weights_of_many_nodes_are_refused_where_they_would_be_stepped():
     net = network({"m": hg.fusion.MatrixWeights()}, ring, rows={name: ROWS["a"] for name in names})
     with pytest.raises(ValueError, match="expected at most 200 nodes"):
         hg.monte_carlo(net, 2, 1, 0)
+
+
+def test_live_data_do_not_say_which_messages_arrived(lossy):
+    with pytest.raises(ValueError, match="fusion 'best' between neighbours: expected which messages arrived"):
+        hg.Timeline(lossy)
+
+
+def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
+    """Rows sorted into parts by their length give what padded rows give."""
+    generator = np.random.default_rng(0)
+    names = [f"n{i}" for i in range(80)]
+    near = hg.fusion.neighbours_within({name: generator.random(2) for name in names}, 0.25)
+    rows = {name: ([[1.0, 0.5]], 0.3) for name in names}
+    plant = hg.LinearPlant([[0.9, 0.3], [0.0, 0.9]], 0.1 * np.eye(2), np.zeros(2), np.eye(2))
+    results = []
+    for few in (64, 100):
+        monkeypatch.setattr("heliograph.fusion.mesh.graph.FEW", few)
+        net = network(
+            {"m": hg.fusion.TraceIntersection(), "d": hg.fusion.DiffusionWeights()}, near, LINK, 1, plant, rows
+        )
+        assert (len(mesh_of(net, "m").buckets) > 1) == (few == 64)
+        arrived = hg.simulation.mesh_arrivals(net, "m", 6, 0)
+        results.append([hg.simulation.mesh_errors(net, name, arrived).actual for name in ("m", "d")])
+    assert results[0][0] == pytest.approx(results[1][0], rel=1e-12)
+    assert results[0][1] == pytest.approx(results[1][1], rel=1e-12)
 
 
 def test_arrivals_of_a_recording_have_their_shape(lossy):

@@ -59,8 +59,11 @@ def arrived_weights_by_component(
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", joint)
-    single = jax.vmap(lambda item: arrived_weights(item.reshape(degree, 1, degree, 1), present)[0, :, 0])
-    return jnp.einsum("ai,ab->aib", single(component), jnp.eye(n))
+
+    def single(item: jax.Array) -> jax.Array:
+        return arrived_weights(item.reshape(degree, 1, degree, 1), present)[0, :, 0]
+
+    return jnp.einsum("ai,ab->aib", jax.vmap(single)(component), jnp.eye(n))
 
 
 def arrived_scalar_weights(
