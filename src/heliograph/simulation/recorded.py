@@ -24,7 +24,7 @@ from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoo
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
-Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
+Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
 def run(
@@ -78,7 +78,7 @@ def run(
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
         given = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = {
+        arrivals: dict[str, PyTree] = {
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
         } | {

@@ -29,8 +29,8 @@ from heliograph.simulation.centres.centre import (
 from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
-from heliograph.simulation.centres.mesh import Arrived, Mesh, meshes_of
-from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
+from heliograph.simulation.centres.mesh import Mesh, meshes_of
+from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
@@ -92,7 +92,7 @@ class AllFilters(Module):
         central = {name: started(item) for name, item in self.central.items()}
         local = tuple(item.init() for item in self.alike)
         sent = tuple(item.init(self.n) for item in self.fusions)
-        reporting = {name: item.init() for name, item in self.reporting.items()}
+        reporting: dict[str, PyTree] = {name: item.init() for name, item in self.reporting.items()}
         reporting |= {name: item.init() for name, item in self.meshes.items()}
         return local, central, sent, tuple(self._started(item, local) for item in self.centres), reporting
 
@@ -123,7 +123,7 @@ class AllFilters(Module):
         z: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
-        drawn: Mapping[str, Drawn | Arrived] | None = None,
+        drawn: Mapping[str, PyTree] | None = None,
         skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
         """Step all filters with the measurements of each group, and with the draws of the uplinks, by fusion.
@@ -164,7 +164,8 @@ class AllFilters(Module):
             learned.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
-        published, reports = {}, {}
+        published: dict[str, PyTree] = {}
+        reports: dict[str, PyTree] = {}
         for name, link in self.reporting.items():
             happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
             published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)

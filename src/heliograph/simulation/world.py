@@ -35,7 +35,7 @@ class World(Module):
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
         z = tuple(arrived(item) if whole else item for item, whole in zip(z, self.filters.complete, strict=True))
-        drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        drawn: dict[str, PyTree] = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
         across = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
         edges = {name: state for name, (state, _) in across.items()}
         drawn |= {name: arrived for name, (_, arrived) in across.items()}

@@ -103,7 +103,10 @@ class DiffusionWeights(AbstractFusion):
         if self.given is not None:
             result = np.array([self._row(graph, i) for i in range(len(graph.senders))])
         result[:, 0] = 0.0
-        return eqx.tree_at(lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None)
+        placed: DiffusionWeights = eqx.tree_at(
+            lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None
+        )
+        return placed
 
     def _row(self, graph: Graph, i: int) -> list[float]:
         """Shares of node i in the graph's order."""

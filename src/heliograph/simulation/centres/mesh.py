@@ -21,14 +21,14 @@ from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
-from heliograph.numerics.types import Bool, Float, PyTree
+from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Listening, listening
 from heliograph.simulation.centres.edges import Edges, edges_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 DENSE = 200  # nodes whose joint covariance is propagated at every step
-Arrived = Bool[jax.Array, "node rounds degree"]  # which messages arrived, each node's from itself first
+Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
 
 
 class MeshState(NamedTuple):
@@ -132,36 +132,38 @@ class Mesh(Module):
             predicted + self._pulled(gains.front, gains.parts, mean) + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         )
         # Covariance of all errors where the rule needs it; it is then what is claimed.
-        joint = None if state.joint is None else self._moved(state.joint, parts, arrived[:, -1])
+        joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
         after = MeshState(mean, gains.covariance, joint, parts.plant)
         return after, self._by_group(mean, claimed)
 
     def parts(
         self,
-        covariance: Float[jax.Array, "node n n"],
-        blocks: Float[jax.Array, "node degree n degree n"] | None,
-        moments: tuple[jax.Array, jax.Array],
-        there: Bool[jax.Array, "node m"],
+        covariance: Float[Array, "node n n"],
+        blocks: Float[Array, "node degree n degree n"] | None,
+        moments: tuple[Array, Array],
+        there: Bool[Array, "node m"],
         arrived: Arrived,
-        u: jax.Array,
-        k: jax.Array,
+        u: Array,
+        k: Array,
     ) -> Parts:
         """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
-        plant: LinearPlant = at(self.plant, k)
+        covariance, there, arrived, u = (jnp.asarray(part) for part in (covariance, there, arrived, u))
+        held = None if blocks is None else jnp.asarray(blocks)
+        plant: LinearPlant = at(self.plant, jnp.asarray(k))
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
-        moments = moved_state(*moments, motion)
+        after = moved_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
         exchanges = []
         for number in range(self.edges.rounds - 1):
             exchanges.append(self._exchange(covariance, arrived[:, number]))
             covariance = exchanges[-1].covariance
         # What each node learns of the measurements, and its gains.
-        data = self._data(self.observe(moments, k), there)
+        data = self._data(self.observe(after, jnp.asarray(k)), there)
         information = self._collected(data.information, arrived)
         complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
-        gains = self.gains(covariance, blocks, arrived[:, -1], motion, information, complete)
-        return Parts(motion, moments, tuple(exchanges), data, information, gains)
+        gains = self.gains(covariance, held, arrived[:, -1], motion, information, complete)
+        return Parts(motion, after, tuple(exchanges), data, information, gains)
 
     def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
         """Measurements of a group, filled with NaN up to the longest."""
@@ -177,8 +179,9 @@ class Mesh(Module):
     def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
         """Messages about what was measured, and about what would be if no component were missing."""
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
-        weighted, information = jax.vmap(_message)(observation.gain, observation.noise, real & there)
-        complete = jax.vmap(_message)(observation.gain, observation.noise, real)[1]
+        gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
+        weighted, information = jax.vmap(_message)(gain, noise, real & there)
+        complete = jax.vmap(_message)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
 
     def observe(self, moments: tuple[jax.Array, jax.Array], k: jax.Array) -> Observation:
@@ -228,15 +231,15 @@ class Mesh(Module):
         padded = [r._replace(parts=_padded(r.parts, degree)) for r in results]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *padded)
 
-    def _collected(self, values: jax.Array, arrived: jax.Array) -> jax.Array:
+    def _collected(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Sums of the nodes' messages that each node has after all rounds, each counted once."""
         if self.edges.rounds == 1:
-            return self.sum_of(values, arrived[:, 0])
+            return self.sum_of(values, jnp.asarray(arrived[:, 0]))
         return jnp.tensordot(self.known(arrived).astype(values.dtype), values, 1)
 
-    def known(self, arrived: jax.Array) -> Bool[jax.Array, "node node"]:
+    def known(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
         """Test whose measurements each node has after all rounds."""
-        known = jnp.eye(len(self.senders), dtype=bool)
+        known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         for number in range(self.edges.rounds):
             known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
         return known

@@ -8,12 +8,15 @@ import numpy as np
 from heliograph.fusion.mesh.graph import graph_of, upstream
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
+from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.centre import described, informed_claim
+from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.simulation.centres.centre import informed_claim
 from heliograph.simulation.centres.edges import check_edge, edges_of
 from heliograph.simulation.node import Node
 
@@ -71,7 +74,7 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
-def _links(fusion: Fusion) -> list[object]:
+def _links(fusion: Fusion) -> list[Channel]:
     """Channels of the edges as they were given."""
     if fusion.link is None:
         return []
@@ -112,7 +115,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     squares = np.zeros((len(nodes), n, n))
     for i, item in enumerate(sensors):
         if isinstance(item, Node):
-            h = _scaled(np.asarray(described(item.channel).mean_gain) @ _matrix(item.sensor))
+            h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(item.sensor))
             squares[i] = h.T @ h
             noise = np.asarray(first(item.sensor).noise.covariance)
             _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
@@ -158,7 +161,7 @@ def _matrix(sensor: object) -> np.ndarray:
 
 def _check_regular(where: str, noise: np.ndarray, item: Node) -> None:
     """Refuse a measurement without noise in some direction: its information has no number."""
-    channel = described(item.channel)
+    channel = second_order(arrived(first(item.channel)))
     gain = np.asarray(channel.mean_gain)
     total = gain @ noise @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
     scale = np.sqrt(np.maximum(np.diagonal(total), 0.0))

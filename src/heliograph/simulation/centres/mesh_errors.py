@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
@@ -70,10 +71,10 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 
 @quickly_compiled
 def _drawn(mesh: Mesh, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    def body(state: PyTree, k: jax.Array) -> tuple[PyTree, jax.Array]:
+    def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         return mesh.edges.draw(state, key, k)
 
-    result: jax.Array = jax.lax.scan(body, mesh.edges.init(key), steps)[1]
+    result: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
     return result
 
 
@@ -153,7 +154,7 @@ def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> n
         joint = congruence(spread(mesh, held, mesh.edges.present), joint)
     # M J M'.
     with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jax.numpy.asarray, (gains, motion))))
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, motion))))
     result = congruence(spread(mesh, m, mesh.edges.present), joint)
     # F Q F', and K_il R_l K_jl' = W_i S_l W_j' over the measurements that both have.
     f = np.asarray(gains.innovation).reshape(nodes * n, n)
@@ -256,7 +257,7 @@ def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k
     blocks = None
     if mesh.needs_joint:
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
-        blocks = jax.numpy.zeros((len(mesh.senders), degree, n, degree, n))
+        blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
     return mesh.parts(covariance, blocks, moments, there, lossless, u, k)
 
 

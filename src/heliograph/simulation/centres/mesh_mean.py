@@ -13,12 +13,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.mesh.gains import Gains
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
@@ -96,10 +98,10 @@ def mean_mesh_errors(
 
 @quickly_compiled
 def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: Parts) -> Gains:
-    information = rows.sum_of(jax.numpy.asarray(step.data.information), jax.numpy.asarray(patterns.present))
-    complete = jax.numpy.asarray(step.information)[patterns.node]
-    held = jax.numpy.asarray(blocks)[patterns.node]
-    return rows.gains(jax.numpy.asarray(covariance), held, jax.numpy.asarray(patterns.present), step.motion,
+    information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
+    complete = jnp.asarray(step.information)[patterns.node]
+    held = jnp.asarray(blocks)[patterns.node]
+    return rows.gains(jnp.asarray(covariance), held, jnp.asarray(patterns.present), step.motion,
                       information, complete)  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def _mean(
 
     # Gains of every pattern, M_i with the node itself first.
     with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jax.numpy.asarray, (gains, step.motion))))
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion))))
     f, w = np.asarray(gains.innovation), np.where(patterns.present[:, :, None, None], gains.gain[:, None], 0.0)
     # Different receivers: products of means.
     result = congruence(spread(mesh, mean(m), mesh.edges.present), joint)
@@ -142,22 +144,27 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     if len(counts) > NODES or counts.max() > DEGREE:
         raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
                    f"{len(counts)} nodes of up to {counts.max()}")  # fmt: skip
-    rows, present, probability, start = [], [], [], []
+    rows: list[int] = []
+    present: list[list[bool]] = []
+    probability: list[float] = []
+    start: list[int] = []
     for i, mine in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
         start.append(len(rows))
         for flags in product(*[[True] if p == 1 else [True, False] for p in mine]):
             rows.append(i)
             present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
-            probability.append(np.prod(np.where(flags, mine, 1 - mine)))
+            probability.append(float(np.prod(np.where(flags, mine, 1 - mine))))
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
 def _arrival(link: Channel | dict[str, Channel] | None, edge: str) -> float:
     """Probability that a message of this edge arrives."""
-    channel, result = link[edge] if isinstance(link, dict) else link, 1.0
+    channel = link[edge] if isinstance(link, dict) else link
+    chance = 1.0
     while isinstance(channel, Erasure):
-        channel, result = channel.base, result * float(channel.arrival)
-    if channel is not None and channel.erases:
+        chance *= float(channel.arrival)
+        channel = channel.base
+    if isinstance(channel, OverTime) or (channel is not None and channel.erases):
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
         raise fail(f"mean errors: link {edge!r}", expected, type(channel).__name__)
-    return result
+    return chance
