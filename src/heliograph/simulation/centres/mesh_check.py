@@ -63,13 +63,15 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
-    Weaker where laws are known up to a radius, or weights are frozen means over losses.
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or what is measured decides whether it
+    is sent.
     """
     parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
              for node in network.mesh_nodes(name)
              if isinstance(item := network.nodes[node], Node)}  # fmt: skip
     known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
-    if isinstance(fusion.rule, FrozenWeights):
+    senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
+    if isinstance(fusion.rule, FrozenWeights) or any(item.trigger is not None for item in senders):
         return "nominal"
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
