@@ -63,8 +63,8 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
-    Weaker where laws are known up to a radius, weights are frozen means over losses, or what is measured decides whether it
-    is sent.
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or a sender decides by what it
+    measured.
     """
     parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
              for node in network.mesh_nodes(name)
