@@ -46,7 +46,7 @@ def test_the_page_shows_every_figure_and_rule(outcome, fits):
 
 @pytest.mark.slow
 def test_numbers_of_a_small_graph():
-    found = without_centre.run(without_centre.Setting(nodes=8, radius=0.6, steps=12, runs=64))
-    best, meet = found.rules["best"], found.rules["intersection"]
-    assert found.best_possible > 1 and 1 - 1e-6 < best.over_best < meet.over_best
+    small = without_centre.run(without_centre.Setting(nodes=8, radius=0.6, steps=12, runs=64))
+    best, meet = small.rules["best"], small.rules["intersection"]
+    assert small.best_possible > 1 and 1 - 1e-6 < best.over_best < meet.over_best
     assert meet.error < meet.claimed and best.error == pytest.approx(best.claimed)

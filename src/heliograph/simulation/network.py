@@ -83,7 +83,9 @@ class Network(Module):
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
-    mesh_kinds: tuple[Kind, ...] = eqx.field(static=True)  # of fusions between neighbours, after the filters' kinds
+    mesh_kinds: tuple[Kind, ...] = eqx.field(
+        static=True
+    )  # of fusions between neighbours, sorted as in compiled code, after the filters' kinds
     single: bool = eqx.field(static=True)
 
     def __init__(
@@ -125,7 +127,7 @@ class Network(Module):
             for alike in _grouped(self.nodes[names[0]].filters.items())
         )
         self.mesh_kinds = tuple(
-            Kind(g, (m,)) for m in self.meshes for g, names in enumerate(self.groups) if m in meshes[names[0]]
+            Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
         # Sensors and channels of each group fit, then fusions.
         for names in self.groups:

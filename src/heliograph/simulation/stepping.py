@@ -170,8 +170,8 @@ class AllFilters(Module):
             happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
             published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
             uplinks |= {name: traffic} if traffic else {}
-        # Fusions between neighbours: estimates of each node, after those of the filters.
-        for name, mesh in self.meshes.items():
+        # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
+        for name, mesh in sorted(self.meshes.items()):
             flags = mesh.edges.lossless() if drawn is None else drawn[name]
             if drawn is None and mesh.edges.groups:
                 raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")

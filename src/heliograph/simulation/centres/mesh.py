@@ -83,11 +83,13 @@ class Mesh(Module):
     """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
 
     `groups`: models of the measurements of the network's groups of nodes, None for nodes without a sensor; `order`
-    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again.
+    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again, `ranks` the
+    nodes of all buckets.
     """
 
     plant: AnyPlant
     buckets: tuple[Rows, ...]
+    ranks: np.ndarray
     edges: Edges
     groups: tuple[Listening | None, ...]
     senders: np.ndarray
@@ -227,9 +229,8 @@ class Mesh(Module):
         if len(results) == 1:
             return results[0]
         # Rows of one length again, in the order of the nodes.
-        degree, order = self.senders.shape[1], np.argsort(np.concatenate([part.rows for part in self.buckets]))
-        padded = [r._replace(parts=_padded(r.parts, degree)) for r in results]
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *padded)
+        padded = [r._replace(parts=_padded(r.parts, self.senders.shape[1])) for r in results]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
     def _collected(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Sums of the nodes' messages that each node has after all rounds, each counted once."""
@@ -336,6 +337,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         buckets=tuple(
             Rows(fusion.rule.placed(part), part.senders[:, 0], part.senders.shape[1]) for part in graph.buckets()
         ),
+        ranks=np.argsort(np.concatenate([part.senders[:, 0] for part in graph.buckets()])),
         edges=edges_of(fusion, graph),
         groups=tuple(groups),
         senders=graph.senders,

@@ -140,7 +140,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
-    """Which modes are not seen with these squares of outputs: True where some does not decay, False where some does."""
+    """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
     size = np.linalg.norm(a, 2) or 1.0
     result = set()
     for value in values:
