@@ -83,8 +83,8 @@ class Mesh(Module):
     """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
 
     `groups`: models of the measurements of the network's groups of nodes, None for nodes without a sensor; `order`
-    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again, `ranks` the
-    nodes of all buckets.
+    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again,
+    `ranks` the nodes of all buckets.
     """
 
     plant: AnyPlant
