@@ -215,6 +215,32 @@ def test_bad_input_is_refused_in_a_line(name):
     assert line in str(error.value) and "\n" not in str(error.value)
 
 
+TWO_WAYS = {"b": ["a", "c"], "c": ["a"]}
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "arrivals", "refused"),
+    [
+        ({"b": ["a"]}, {"a to b": 0.3}, True),  # .7 lost, of a mode of 1.2 at most 1 / 1.44 = .694
+        ({"b": ["a"]}, {"a to b": 0.31}, False),
+        (TWO_WAYS, {"a to b": 0.16, "c to b": 0.16, "a to c": 1.0}, True),  # .84 squared = .706
+        (TWO_WAYS, {"a to b": 0.17, "c to b": 0.17, "a to c": 1.0}, False),  # .83 squared = .689
+    ],
+)
+def test_losses_above_the_square_of_a_mode_are_refused(neighbours, arrivals, refused):
+    plant = hg.LinearPlant([[1.2]], [[0.1]], [0.0], [[1.0]])
+    links = {name: hg.erasure(hg.perfect(), arrival) for name, arrival in arrivals.items()}
+
+    def made():
+        return network({"m": RULES["trace"]}, neighbours, links, plant=plant, rows={"a": ([[1.0]], 0.3)})
+
+    if refused:
+        with pytest.raises(ValueError, match=r"expected losses below 0\.694 in all of what node 'b' learns"):
+            made()
+    else:
+        assert made().claims()["b"]["m"] == "upper"
+
+
 def test_a_decaying_mode_that_nobody_sees_is_kept_with_a_warning():
     plant = hg.LinearPlant(np.diag([1.02, 0.5]), 0.1 * np.eye(2), np.zeros(2), np.eye(2))
     rows = {"a": ([[1.0, 0.0]], 0.3), "b": ([[1.0, 0.0]], 0.3)}
@@ -232,7 +258,7 @@ def test_best_weights_of_many_nodes_are_refused_where_they_would_be_stepped():
 
 def test_live_data_do_not_say_which_messages_arrived(lossy):
     with pytest.raises(ValueError, match="fusion 'best' between neighbours: expected which messages arrived"):
-        hg.Timeline(lossy)
+        hg.Timeline(lossy, window=10.0)
 
 
 def test_parts_of_a_large_graph_are_the_whole(monkeypatch):

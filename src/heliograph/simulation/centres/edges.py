@@ -159,6 +159,16 @@ def check_edge(link: Channel) -> None:
                 raise fail("link between neighbours", expected, type(first(link)).__name__)
 
 
+def arrival_chance(channel: Channel | None) -> float | None:
+    """Probability that a message arrives; None where it is not the same at every step whatever was before."""
+    chance = 1.0
+    while isinstance(channel, Erasure):
+        chance *= float(channel.arrival)
+        channel = channel.base
+    steady = channel is None or not (isinstance(channel, OverTime) or channel.erases)
+    return chance if steady else None
+
+
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
     """Test whether a channel delivers what is sent."""
     if channel.inputs != channel.outputs:

@@ -4,8 +4,10 @@ import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_flow
 
-from heliograph.fusion.mesh.graph import graph_of, upstream
+from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
@@ -17,13 +19,14 @@ from heliograph.numerics.check import fail
 from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import check_edge, edges_of
+from heliograph.simulation.centres.edges import arrival_chance, check_edge, edges_of
 from heliograph.simulation.node import Node
 
 if TYPE_CHECKING:
     from heliograph.simulation.network import Network
 
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
+CUTS, UNIT = 200, 1e5  # nodes whose losses are judged, and the digits of a loss's logarithm
 RANK = 1e-9  # relative: singular values of a mode's observability below are zero
 
 
@@ -58,6 +61,7 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     fusion.rule.placed(graph)
     mesh_claim(name, fusion, network)
     _check_seen(what, name, fusion, network)
+    _check_losses(what, fusion, network, graph)
 
 
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
@@ -137,6 +141,47 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     if unseen[False]:
         warnings.warn(f"{what}: a decaying mode is observed by nobody upstream of {unseen[False][:5]}; their errors "
                       "are those of its prior", stacklevel=4)  # fmt: skip
+
+
+def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+    """Refuse a node whose error grows whatever the rule, since messages from those that see a mode are lost too often.
+
+    Of nodes that do not see the mode lambda, none may get a message with a probability p of |lambda|^2 p >= 1: p is the
+    product of the loss probabilities of all edges into them, over sets of nodes the largest, by a minimal cut.
+    """
+    link, names = fusion.link, graph.nodes
+    if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
+        return
+    chances = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
+               for j, i in graph.edges]  # fmt: skip
+    if any(chance is None for chance in chances):
+        return
+    # Capacities -log p in whole units; those that are never cut get more than all others together.
+    exact = np.array([-np.log(max(1 - float(c or 0.0), 1e-300)) for c in chances])
+    units = np.minimum(np.round(UNIT * exact), 1e8).astype(np.int32)
+    values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
+    for value, vector in zip(values, vectors.T, strict=True):
+        if abs(value) <= 1 + MODE:
+            continue
+        sees = np.array([_sees(network.nodes[name], vector) for name in names])
+        source = len(names)
+        rows = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
+        columns = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
+        data = np.concatenate([units, np.full(sees.sum(), 2**30, dtype=np.int32)]).astype(np.int32)
+        flow = csr_array((data, (rows, columns)), shape=(source + 1, source + 1))
+        for i in np.flatnonzero(~sees):
+            cut = maximum_flow(flow, source, int(i)).flow_value / UNIT
+            if cut <= 2 * np.log(abs(value)) * (1 - MODE):
+                raise fail(what, f"losses below {1 / abs(value) ** 2:.3g} in all of what node {names[i]!r} learns of a "
+                           f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip
+
+
+def _sees(item: object, vector: np.ndarray) -> bool:
+    """Test whether a node's own measurement shows a mode."""
+    if not isinstance(item, Node):
+        return False
+    h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(first(item.sensor)))
+    return bool(np.any(np.abs(h @ vector) > RANK))
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:

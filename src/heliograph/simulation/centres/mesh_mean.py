@@ -20,13 +20,12 @@ from heliograph.fusion.mesh.gains import Gains
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.erasure import Erasure
 from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.centres.edges import arrival_chance
 from heliograph.simulation.centres.mesh import Mesh, Parts, Rows, transitions
 from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
 from heliograph.simulation.network import Network
@@ -72,7 +71,7 @@ def mean_mesh_errors(
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
-    chances = [_arrival(item.link, f"{sender} to {names[i]}")
+    chances = [_known(item.link, f"{sender} to {names[i]}")
                for i in range(len(names)) for sender in (item.neighbours or {})[names[i]]]  # fmt: skip
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
@@ -157,14 +156,11 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
-def _arrival(link: Channel | dict[str, Channel] | None, edge: str) -> float:
-    """Probability that a message of this edge arrives."""
+def _known(link: Channel | dict[str, Channel] | None, edge: str) -> float:
+    """Probability that a message of this edge arrives, at every step the same and drawn anew."""
     channel = link[edge] if isinstance(link, dict) else link
-    chance = 1.0
-    while isinstance(channel, Erasure):
-        chance *= float(channel.arrival)
-        channel = channel.base
-    if isinstance(channel, OverTime) or (channel is not None and channel.erases):
+    chance = arrival_chance(channel)
+    if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
         raise fail(f"mean errors: link {edge!r}", expected, type(channel).__name__)
     return chance
