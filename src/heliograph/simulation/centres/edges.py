@@ -56,8 +56,8 @@ class Edges(Module):
 
     def draw(self, states: tuple[PyTree, ...], key: jax.Array, k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         """Draw what arrives at step k in each round: next states, and flags (node, rounds, degree)."""
-        # One exchange after another, each with its draws; channels with memory go on from one to the next.
         rounds = []
+        # One exchange after another, each with its draws; channels with memory go on from one to the next.
         for number in range(self.rounds):
             flags, following = jnp.asarray(self.present), []
             for group, state in zip(self.groups, states, strict=True):
@@ -88,8 +88,8 @@ class Edges(Module):
         Raises:
             ValueError: nodes without flags or the reverse, shapes that do not fit.
         """
-        # Everything arrives, unless a report says otherwise.
         result = np.repeat(self.lossless()[None], steps, axis=0)
+        # Everything arrives, unless a report says otherwise.
         if reports is None and not self.groups:
             return result
         receivers = [node for node, there in zip(nodes, self.present, strict=True) if there[1:].any()]
