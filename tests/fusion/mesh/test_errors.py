@@ -49,12 +49,14 @@ def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, we
     assert errors.claim == "exact"
 
 
+@pytest.mark.slow
 def test_an_intersection_claims_at_least_its_error_for_every_pattern(lossy):
     for seed, name in product(range(3), ("equal", "trace")):
         errors = hg.simulation.mesh_errors(lossy, name, hg.simulation.mesh_arrivals(lossy, name, 30, seed))
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
+@pytest.mark.slow
 def test_best_weights_are_no_worse_than_any_other_of_one_step(lossy):
     arrived = hg.simulation.mesh_arrivals(lossy, "best", 2, 1)
     result = {name: hg.simulation.mesh_errors(lossy, name, arrived).mean_trace() for name in RULES}
@@ -70,6 +72,7 @@ def test_where_everybody_receives_everybody_every_node_is_the_central_filter():
         assert errors.claimed[-1] == pytest.approx(errors.actual[-1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_as_many_rounds_as_the_graph_is_long_make_every_node_the_central_filter():
     line = {"a": ["b"], "b": ["a", "c"], "c": ["b", "d"], "d": ["c"]}
     for rounds, same in ((3, True), (2, False)):
@@ -78,6 +81,7 @@ def test_as_many_rounds_as_the_graph_is_long_make_every_node_the_central_filter(
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
+@pytest.mark.slow
 def test_rounds_with_losses_claim_at_least_the_error_and_beat_one_round():
     rules = {"m": hg.fusion.TraceIntersection()}
     result = {}
@@ -128,6 +132,7 @@ def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy)
         assert bound[i] == pytest.approx(least, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_no_rule_beats_the_bound(lossy):
     arrived = hg.simulation.mesh_arrivals(lossy, "best", 12, 5)
     bound = hg.simulation.best_possible(lossy, "best", arrived)
@@ -189,6 +194,7 @@ def listed_mean(neighbours, names, steps, chance):
     return joint.reshape(count, n, count, n)
 
 
+@pytest.mark.slow
 def test_frozen_best_weights_claim_what_they_err():
     net = network({"m": hg.fusion.DiagonalWeights()}, link=LINK)
     frozen = hg.simulation.freeze(net, "m", hg.simulation.mesh_arrivals(net, "m", 60, 0), last=40)

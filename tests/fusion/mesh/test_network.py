@@ -28,6 +28,7 @@ def record(lossy):
     return hg.monte_carlo(lossy, STEPS, RUNS, 4)
 
 
+@pytest.mark.slow
 def test_every_node_has_an_estimate_with_its_claim(lossy, record):
     assert {name: claim for name, claim in lossy.claims()["b"].items()} == {
         "best": "exact", "trace": "upper", "diffusion": "exact"
@@ -39,6 +40,7 @@ def test_every_node_has_an_estimate_with_its_claim(lossy, record):
     assert arrived == pytest.approx(0.7, abs=4 * np.sqrt(0.21 / (4 * RUNS * STEPS)))
 
 
+@pytest.mark.slow
 def test_exact_claims_are_the_errors_and_upper_ones_not_below(record):
     # 640 runs of 12 correlated steps: the mean of a NEES of 2 states has a deviation of about .015
     for name, (least, most) in {"best": (0.95, 1.05), "diffusion": (0.95, 1.05), "trace": (0.5, 1.05)}.items():
@@ -49,6 +51,7 @@ def test_exact_claims_are_the_errors_and_upper_ones_not_below(record):
             assert least < nees.mean() < most, (node, name, nees.mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_claims_of_a_run_are_those_given_its_arrivals(lossy, record, name):
     arrived = hg.simulation.mesh_arrivals(lossy, name, STEPS, jax.random.fold_in(jax.random.key(4), 7))
@@ -57,6 +60,7 @@ def test_claims_of_a_run_are_those_given_its_arrivals(lossy, record, name):
         assert np.asarray(record.estimates[node][name].covariance)[7] == pytest.approx(errors.claimed[:, i], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_recording_gives_what_the_run_gave(lossy, record):
     reports = {name: {n: item.values[3] for n, item in mine.items()} for name, mine in record.reports.items()}
     again = hg.run(lossy, {n: z[3] for n, z in record.measurements.items()}, reports=reports)
@@ -67,6 +71,7 @@ def test_a_recording_gives_what_the_run_gave(lossy, record):
             assert np.asarray(now.covariance) == pytest.approx(np.asarray(then.covariance)[3], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_statistics_have_each_node(lossy):
     statistics = hg.monte_carlo(lossy, STEPS, 64, 4, hg.Statistics())
     assert statistics["b"]["trace"].claim == "upper"
@@ -256,11 +261,21 @@ def test_best_weights_of_many_nodes_are_refused_where_they_would_be_stepped():
         hg.monte_carlo(net, 2, 1, 0)
 
 
-def test_live_data_do_not_say_which_messages_arrived(lossy):
+@pytest.mark.slow
+def test_a_timeline_has_every_node_where_no_message_gets_lost(lossy):
+    whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
+    z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}
+    expected = hg.run(whole, z).estimates["b"]["trace"]
+    timeline = hg.Timeline(whole, window=10.0)
+    for k in range(3):
+        for name in ("a", "c", "d"):
+            assert timeline.push(name, k, float(k), z[name][k]) == "used"
+    assert timeline.estimates()["b"]["trace"].mean == pytest.approx(np.asarray(expected.mean)[-1], rel=1e-9)
     with pytest.raises(ValueError, match="fusion 'best' between neighbours: expected which messages arrived"):
         hg.Timeline(lossy, window=10.0)
 
 
+@pytest.mark.slow
 def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
     """Rows sorted into parts by their length give what padded rows give."""
     generator = np.random.default_rng(0)
