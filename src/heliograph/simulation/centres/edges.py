@@ -14,9 +14,8 @@ from heliograph.model.over_time import OverTime, at, first, stack, structure, un
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, PyTree
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine, anonymous
-from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.erasure import Erasure, arrived
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports

@@ -16,7 +16,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
-from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
 from heliograph.simulation.centres.edges import arrival_chance, check_edge, edges_of
