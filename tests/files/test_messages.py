@@ -126,7 +126,8 @@ def test_a_csv_file_is_mapped_by_the_same_object(world, tmp_path):
     network, sources, *_ = world
     place = hg.files.json_field("Position [mm]", "gps", scale=1e-3, time="Date")
     (tmp_path / "log.csv").write_text(
-        "Date,Position [mm],Note\n2026-01-01T00:00:00Z,1500,start\n2026-01-01T00:00:02Z,,\n2026-01-01T00:00:01Z,250.5,\n"
+        "Date,Position [mm],Note\n2026-01-01T00:00:00Z,1500,start\n"
+        "2026-01-01T00:00:02Z,,\n2026-01-01T00:00:01Z,250.5,\n"
     )
     table = hg.files.read_messages(tmp_path / "log.csv", network, {"log.csv": place})
     rows = table.recording()

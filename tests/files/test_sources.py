@@ -77,7 +77,7 @@ def test_times_keep_every_nanosecond(value, unit, expected):
     "value", ["2023-11-14T22:13:20", "noon", True, None, np.nan, 0, SimpleNamespace(sec=0, nanosec=0), 1e300]
 )
 def test_what_is_no_time_is_refused(value):
-    with pytest.raises(ValueError, match="^t: expected "):
+    with pytest.raises(ValueError, match=r"^t: expected "):
         nanoseconds(value, "s", "t")
 
 
@@ -165,5 +165,5 @@ def test_a_table_that_does_not_fit_is_one_line(table, line):
     ],
 )
 def test_bad_input_is_one_line(arguments):
-    with pytest.raises(ValueError, match="^json_field, .*: expected"):
+    with pytest.raises(ValueError, match=r"^json_field, .*: expected"):
         json_field(**({"node": "garden"} | arguments))

@@ -81,7 +81,7 @@ def pose_of(states: tuple[str, ...]) -> Pose:
 def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = None, pose: Pose | None = None) -> None:
     """Write the estimates of a record to an MCAP file, as a whole or not at all.
 
-    Topics are /NODE/FILTER/odometry if a state is on an axis of the pose, and a number for each state and its deviation,
+    Topics are /NODE/FILTER/odometry if a state is on an axis of the pose, and a number for each state and deviation,
     /NODE/FILTER/STATE and /NODE/FILTER/STATE/sd; only rows with sound estimates. A covariance that nobody claims begins
     with -1, as messages of ROS say that it is unknown.
 

@@ -11,6 +11,7 @@ from pydantic_core import from_json
 
 from heliograph.live.event import VERDICTS
 from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.running_nis import RunningNis
 
@@ -205,7 +206,7 @@ class Watched:
         """Return the service's unpublished outputs."""
         return self.service.unpublished()
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, and record its outputs."""
         with self.watch.lock:
             outputs = self.service.take(payloads)

@@ -4,6 +4,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from heliograph.numerics.check import InputError
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 
@@ -11,11 +12,11 @@ class Batch(NamedTuple):
     """Messages that were received together.
 
     Args:
-        payloads: the messages, each a line of JSON.
+        payloads: the messages: lines of JSON, and those that were read from topics of others.
         acknowledge: to be awaited after the commit; it tells the sender that the messages are stored.
     """
 
-    payloads: Sequence[bytes]
+    payloads: Sequence[Payload]
     acknowledge: Callable[[], Awaitable[None]]
 
 
