@@ -3,8 +3,12 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import lru_cache
+from math import isfinite
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
@@ -18,6 +22,7 @@ from heliograph.simulation.network import Network
 
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))  # ROS 2, ROS 1, protobuf
+PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
 
 
@@ -174,7 +179,10 @@ class Sources:
     def _reading(self, source: Source, places: np.ndarray, message: object, where: str) -> Reading:
         values = np.full(len(self._names[source.node]), np.nan)
         for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
-            values[place] = scale * number(at(message, path, where), f"{where}, field {path!r}") + offset
+            value = at(message, path, where)
+            if type(value) is not float:  # names its place only where there may be something to say
+                value = number(value, f"{where}, field {path!r}")
+            values[place] = scale * value + offset if isfinite(value) else np.nan
         # A time names its measurement; without one the count is left to the receiver.
         time = None
         if source.time is not None:
@@ -233,6 +241,10 @@ def at(message: object, path: str, where: str) -> Any:
     Raises:
         ValueError: no such field; one line with the path and the fields that are there.
     """
+    # Objects first, since a bag has millions of them.
+    if path and not isinstance(message, PLAIN):
+        with suppress(AttributeError):
+            return _getter(path)(message)
     value: Any = message
     rest = path
     while rest:
@@ -249,6 +261,11 @@ def at(message: object, path: str, where: str) -> Any:
         else:
             raise fail(where, f"a field {path!r}", f"no {name!r} in {_fields(value)}")
     return value
+
+
+@lru_cache
+def _getter(path: str) -> "attrgetter[Any]":
+    return attrgetter(path)
 
 
 def number(value: Any, name: str) -> float:
@@ -270,13 +287,14 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
     """
-    for pair in STAMPS:
+    for pair in STAMPS if not isinstance(value, int | float | str) else ():
         if isinstance(value, Mapping) and set(pair) <= value.keys():
             value = int(value[pair[0]]) * 10**9 + int(value[pair[1]])
             unit = "ns"
         elif hasattr(value, pair[0]) and hasattr(value, pair[1]):
             value = int(getattr(value, pair[0])) * 10**9 + int(getattr(value, pair[1]))
             unit = "ns"
+            break
     if isinstance(value, str):
         try:
             instant(value)

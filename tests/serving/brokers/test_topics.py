@@ -117,14 +117,13 @@ def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
     assert translator.line(b'{"node": "garden"}') == [b'{"node": "garden"}'] and translator.line(b"x") == [b"x"]
 
 
-def test_sources_and_parts_exclude_each_other(translator):
+def test_sources_and_parts_exclude_each_other():
     from heliograph.serving.brokers.url import address
     from heliograph.serving.fleet import Options
     from heliograph.serving.running import ServiceSettings
 
-    network = hg.Network(
-        hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), {"a": hg.Node(hg.LinearSensor([[1.0]], 1.0))}
-    )
+    plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
     with pytest.raises(ValueError, match="--parts: expected messages in our own form"):
         ServiceSettings(network, Options(1.0), "s.db", broker=address("nats://a", {}), parts=2, sources={"t": "f"})
 
