@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .bag_output import (
+    Pose as Pose,
+)
 from .event_table import (
     EventTable as EventTable,
 )
