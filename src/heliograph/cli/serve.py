@@ -27,7 +27,7 @@ def serve(
         list[str] | None,
         Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),
     ] = None,
-    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
+    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, or opc.tcp://host:port.")] = None,
     parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,

@@ -22,6 +22,8 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
     Raises:
         ValueError: no connection; one line that names the broker.
     """
+    if address.kind == "opc.tcp":
+        raise fail(f"{address}", "mqtt:// or nats://, whose topics can be listened to", address.kind)
     topics: dict[str, Topic] = {}
     if address.kind == "mqtt":
         _listen_mqtt(address, seconds, topics)
