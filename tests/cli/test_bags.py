@@ -76,7 +76,7 @@ def test_inspect_lists_topics_and_suggests_sources(folder, capsys):
     assert "time='header.stamp'" in said and "'linear.x', node='NODE'" in said
     scope: dict[str, object] = {"hg": hg}
     exec(said[said.index("sources = {") :], scope)  # what it suggests is Python that runs
-    assert set(scope["sources"]) == {"/odometry", "/acceleration"}
+    assert set(scope["sources"]) == {"/odometry", "/acceleration", "/picture"}
     assert cli.main(["inspect", "none.mcap"]) == 2
     assert "none.mcap: expected a bag, got nothing of that name" in capsys.readouterr().err
     (folder / "cut.mcap").write_bytes((folder / "drive" / "drive.mcap").read_bytes()[:5000])

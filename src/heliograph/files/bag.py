@@ -169,6 +169,7 @@ def moment(nanoseconds: int) -> str:
 
 def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
     """Check before reading that each mapped field is in its topic's type, as far as the bag says."""
+    # Paths that the sources need of each topic, against the fields of its type.
     for connection in reader.connections:
         fields = dict(fields_of(reader, connection.msgtype))
         needed = [

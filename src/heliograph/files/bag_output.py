@@ -150,6 +150,7 @@ def _topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> I
 
 def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
     """Yield time, topic and message of each estimate, in order of time."""
+    # Estimates as arrays, once for all rows.
     number, places = types[NUMBER], pose.places(record.states)
     moves = any(place is not None for part in places for place in part)
     parts = [

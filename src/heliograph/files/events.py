@@ -90,6 +90,7 @@ def run_events(
     Raises:
         ValueError: what `read_events` and `Timeline` refuse, a lag beyond the window.
     """
+    # Events of a table, or of messages, with the date from which their times count.
     events: Iterable[Event]
     if table is None:
         events, origin = read_events(path, network)
@@ -100,6 +101,7 @@ def run_events(
     continuous = TIME_STEP in network.inputs
     start = first if continuous else 0.0  # the initial law is that of the first moment
     result = play(network, events, window, lag, start)
+    # Summary: verdicts by node, what was forced, and the file of lagged estimates.
     lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in element.items() if count)
              for node, element in result.counts.items() if any(element.values())]  # fmt: skip
     if result.forced:

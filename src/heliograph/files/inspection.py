@@ -1,4 +1,4 @@
-"""What is in a bag or comes from a broker: topics, rates, gaps and lateness, and sources to paste."""
+"""Topics of a bag or a broker: their rates, gaps and lateness, and sources to paste."""
 
 import json
 import struct
@@ -57,6 +57,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         ValueError: no bag, or one that cannot be opened.
     """
     topics: dict[str, Topic] = {}
+    # Types first, then each message's times, of which a header is read without decoding the rest.
     with opened(path) as reader:
         for connection in reader.connections:
             fields = list(fields_of(reader, connection.msgtype))

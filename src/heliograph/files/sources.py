@@ -287,6 +287,7 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
     """
+    # Stamps of two whole numbers, then dates, then numbers.
     for pair in STAMPS if not isinstance(value, int | float | str) else ():
         if isinstance(value, Mapping) and set(pair) <= value.keys():
             value = int(value[pair[0]]) * 10**9 + int(value[pair[1]])

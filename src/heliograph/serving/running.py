@@ -124,6 +124,7 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
+    # The store first, whose state the service goes on from.
     stop = asyncio.Event()
     fleet = Fleet(lanes, settings.options)
     store = _open_store(settings, fleet)

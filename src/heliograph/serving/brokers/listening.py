@@ -49,6 +49,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
         if not message.retain:  # it says nothing of rate and lateness
             note(topics, message.topic, bytes(message.payload), time.time_ns())
 
+    # Callbacks run in the client's thread while this one sleeps.
     client = Client(CallbackAPIVersion.VERSION2)
     client.on_connect, client.on_message = connected, message
     if address.user is not None:
@@ -75,6 +76,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
         if not item.subject.startswith(INTERNAL):
             note(topics, item.subject.replace(".", "/"), item.data, time.time_ns())
 
+    # Connect, listen for a while, and leave.
     try:
         client = await nats.connect(
             f"nats://{address.host}:{address.port}",

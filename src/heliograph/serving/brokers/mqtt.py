@@ -111,6 +111,7 @@ class _Reader(_Connection):
 
     async def receive(self) -> Batch:
         batch, payloads = list[tuple[int, MQTTMessage, datetime]](), list[Payload]()
+        # Wait until messages came of which there is something to give.
         while not payloads:  # the word that one came may come after the batch that took it
             for connection, message, _ in batch:  # of topics that nobody reads
                 self._acknowledge(connection, message)
