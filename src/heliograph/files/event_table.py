@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.network import Network
 
@@ -48,6 +48,7 @@ class EventTable:
     """
 
     def __init__(self, network: Network):
+        instance("network", network, Network, "a Network")
         self.network, self.steps = network, TIME_STEP not in network.inputs
         given = len(network.inputs) - (not self.steps)
         self.columns = {INPUTS: Columns(given)}

@@ -83,5 +83,5 @@ def test_what_the_server_states_is_read_and_subscribed():
 
 @pytest.mark.real("OPC UA")
 def test_no_server_is_one_line():
-    with pytest.raises(InputError, match=r"^OPC UA server opc\.tcp://127\.0\.0\.1:\d+: expected an answer, got "):
+    with pytest.raises(InputError, match=r"^OPC UA server opc\.tcp://127\.0\.0\.1:\d+/: expected an answer, got "):
         read_reporting(f"opc.tcp://127.0.0.1:{free_port()}", [VARIABLE])

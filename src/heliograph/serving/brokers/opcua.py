@@ -12,12 +12,12 @@ from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
 from heliograph.model.trigger import SendOnDelta
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, items, shown, text
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.retry import Retry
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import Batch, nothing
-from heliograph.serving.brokers.url import Address
+from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
@@ -67,15 +67,19 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
         ValueError: no server there, an unknown variable; one line.
         ModuleNotFoundError: asyncua is not installed (extra "opcua").
     """
+    where = address(url)
+    if where.kind != "opc.tcp":
+        raise fail("url", "opc.tcp://host:port/path", where.kind)
+    names = [text("variable", name) for name in items("variables", variables, "identifiers")]
 
     async def work() -> dict[str, Reporting]:
         async with Client(url, timeout=WAIT) as client:
-            return {name: await reporting_of(_node(client, name)) for name in variables}
+            return {name: await reporting_of(_node(client, name)) for name in names}
 
     try:
         return asyncio.run(work())
     except AWAY as error:
-        raise fail(f"OPC UA server {url}", "an answer", f"{type(error).__name__} {error}") from None
+        raise fail(f"OPC UA server {where}", "an answer", f"{type(error).__name__} {error}") from None
 
 
 async def reporting_of(node: Node) -> Reporting:
