@@ -9,9 +9,9 @@ from asyncua import Server, ua
 
 import heliograph as hg
 from heliograph.numerics.check import InputError
-from heliograph.serving.brokers.broker import connected
 from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import address
 from heliograph_studies.live.server import free_port
 

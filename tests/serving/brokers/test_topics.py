@@ -18,8 +18,8 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 import heliograph as hg
-from heliograph.serving.brokers.broker import connected
 from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.transport import connected
 from heliograph.serving.message import Message
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import at, running

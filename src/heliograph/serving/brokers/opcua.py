@@ -14,9 +14,8 @@ from asyncua.ua.uaerrors import UaError
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, shown, text
 from heliograph.serving.brokers.pipe import Pipe
-from heliograph.serving.brokers.retry import Retry
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import Batch, nothing
+from heliograph.serving.brokers.transport import Batch, Retry, nothing
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
