@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from heliograph.files.cut_bag import is_cut, whole_part
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources
 from heliograph.numerics.check import InputError, fail, shown_error
@@ -53,10 +54,13 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
     sources, result = Sources(table, network), EventTable(network)
-    with opened(path) as reader:
+    with opened(path) as (reader, cut):
+        result.broken = cut
         counts = Counter[str]()
         for connection in reader.connections:
             counts[connection.topic] += connection.msgcount
+        if cut and not counts:
+            raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
         used = [topic for topic in counts if sources.of(topic)]
         if not used:
             raise fail(f"{path}", f"a topic of the sources, {_listed(sources.topics)}", f"only {_listed(counts)}")
@@ -88,25 +92,34 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
 
 
 @contextmanager
-def opened(path: Path) -> "Iterator[AnyReader]":
-    """Open a bag for reading.
+def opened(path: Path) -> "Iterator[tuple[AnyReader, str]]":
+    """Open a bag for reading; of an MCAP file that was cut off, what is whole, and a line that says so, else "".
 
     Raises:
         ValueError: no bag, or one that cannot be opened; one line that names it.
     """
+    if not path.exists():
+        raise fail(str(path), "a bag", "nothing of that name")
+    with ExitStack() as stack:
+        place, cut = path, ""
+        if path.suffix.lower() == ".mcap" and is_cut(path):
+            place, end = stack.enter_context(whole_part(path))
+            got = f"one that was cut off after {end:,} bytes of whole records"
+            cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
+        yield stack.enter_context(_reader(path, place)), cut
+
+
+@contextmanager
+def _reader(path: Path, place: Path) -> "Iterator[AnyReader]":
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    if not path.exists():
-        raise fail(str(path), "a bag", "nothing of that name")
-    reader = None
     try:
         # Types of ROS itself, for bags of releases that did not write them into the bag.
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader = AnyReader([place], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     except Exception as error:  # whatever a damaged file makes a reader do
-        end = "a bag that can be opened (of one that was cut off, `mcap recover` or `ros2 bag reindex` save the rest)"
-        raise fail(str(path), end, _reason(error)) from None
+        raise fail(str(path), "a bag that can be opened", _reason(error)) from None
     try:
         yield reader
     finally:

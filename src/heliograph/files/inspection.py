@@ -58,7 +58,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
     """
     topics: dict[str, Topic] = {}
     # Types first, then each message's times, of which a header is read without decoding the rest.
-    with opened(path) as reader:
+    with opened(path) as (reader, cut):
         for connection in reader.connections:
             fields = list(fields_of(reader, connection.msgtype))
             numbers = [name for name, kind in fields if kind not in NO_NUMBERS and not name.startswith("header.")]
@@ -75,7 +75,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
             return topics, str(fail(f"{path}, after message {done}", "a bag without damage", shown_error(error)))
-    return topics, ""
+        return topics, cut
 
 
 def note(topics: dict[str, Topic], name: str, payload: bytes, arrival: int) -> None:
