@@ -33,7 +33,8 @@ def inspect(
     from heliograph.report.progress import progress
 
     scalar("--seconds", seconds, TINY, 86400)
-    broken, names = "", {}
+    broken = ""
+    names: dict[str, tuple[str, ...]] = {}
     if network:
         from heliograph.files.network_file import load_network
 
