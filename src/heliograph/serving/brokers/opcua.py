@@ -141,7 +141,7 @@ class OpcUa:
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Translate a change; the first value of a subscription was there before, as a stored message."""
         name, value = node.nodeid.to_string(), data.monitored_item.Value
-        good = value.StatusCode_ is None or value.StatusCode_.is_good()
+        good = value.StatusCode is None or value.StatusCode.is_good()
         content = {
             "value": val if good and isinstance(val, bool | int | float) else None if not good else shown(val),
             "source_time": _iso(value.SourceTimestamp),
