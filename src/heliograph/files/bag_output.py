@@ -158,6 +158,7 @@ def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Itera
         for node, filters in record.estimates.items()
         for name, e in filters.items()
     ]
+    # Row by row, in order of time.
     for k, stamp in enumerate(times):
         for prefix, mean, covariance, claims, sound in parts:
             if not sound[k]:
