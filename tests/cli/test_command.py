@@ -137,6 +137,7 @@ def test_lists_do_not_load_jax():
             "network-design",
             "range-bearing",
             "smoothing",
+            "uwb",
             "without-centre",
         )
     ]
