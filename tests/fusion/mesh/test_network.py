@@ -296,6 +296,11 @@ def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
     assert results[0][1] == pytest.approx(results[1][1], rel=1e-12)
 
 
+def test_estimates_between_neighbours_are_not_smoothed(lossy):
+    with pytest.raises(ValueError, match="smoothing: expected filters, and fusions at a centre"):
+        hg.monte_carlo(lossy, 4, 1, 0, smooth=hg.smoothing.FixedInterval())
+
+
 def test_arrivals_of_a_recording_have_their_shape(lossy):
     z = {name: np.zeros((3, node.received)) for name, node in lossy.nodes.items()}
     for reports, line in (
