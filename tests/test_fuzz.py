@@ -29,12 +29,12 @@ PRIOR = {"initial_mean": [0.0, 0.0], "initial_covariance": EYE}
 NETWORK = hg.Network(PLANT, {"a": NODE})
 
 CALLS = [  # what is called, and arguments with which it works
-    (hg.Discrete, {"values": [1.0, 2.0], "probabilities_": [0.5, 0.5], "radius": 0.0}),
+    (hg.Discrete, {"values": [1.0, 2.0], "probabilities": [0.5, 0.5], "radius": 0.0}),
     (hg.LogNormal, {"log_mean": 0.0, "log_deviation": 1.0}),
     (hg.Nakagami, {"shape": 1.0, "power": 1.0}),
     (hg.Rayleigh, {"scale": 1.0}),
     (hg.Rician, {"sight": 1.0, "scale": 1.0}),
-    (hg.Gaussian, {"covariance_": EYE, "mean": [0.0, 0.0]}),
+    (hg.Gaussian, {"covariance": EYE, "mean": [0.0, 0.0]}),
     (hg.LinearPlant, {"matrix": EYE, "noise": 0.1, **PRIOR, "input_matrix": [[1.0], [0.0]], "states": ["a", "b"],
                      "inputs": ["u"]}),
     (hg.Plant, {"transition": lambda x, u: x, "noise": 0.1 * EYE, **PRIOR, "states": ["a", "b"], "inputs": ["u"]}),
@@ -79,7 +79,7 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.GivenMoments, {"moments": [0.0, 1.0]}),
     (random_affine.bernoulli, {"probability": 0.5}),
     (random_affine.NoiseMoments, {"moments": [0.0, 1.0, 0.0, 3.0]}),
-    (random_affine.FiniteSupport, {"atoms": [[1.0], [-1.0]], "probabilities_": [0.5, 0.5]}),
+    (random_affine.FiniteSupport, {"atoms": [[1.0], [-1.0]], "probabilities": [0.5, 0.5]}),
     (random_affine.Independent, {"parts": [COIN]}),
     (random_affine.Shaped, {"matrix": [[1.0], [2.0]], "source": COIN}),
     (random_affine.second_order, {"channel": HOP}),
@@ -89,7 +89,7 @@ CALLS = [  # what is called, and arguments with which it works
     (linear.true_covariance, {"system": SYSTEM, "schedule": SCHEDULE}),
     (linear.state_moments, {"system": SYSTEM}),
     (linear.Schedule, {"gains": SCHEDULE.gains, "start": SCHEDULE.start, "claim": "exact"}),
-    (linear.LinearSystem, {"steps": SYSTEM.steps, "mean": SYSTEM.mean, "covariance_": SYSTEM.covariance,
+    (linear.LinearSystem, {"steps": SYSTEM.steps, "mean": SYSTEM.mean, "covariance": SYSTEM.covariance,
                           "projection": SYSTEM.projection}),
     (linear.load_schedule, {"path": "nothing.npz"}),
     (relays.own_error_design, {"network": RELAYS, "horizon": 2}),

@@ -17,16 +17,16 @@ from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.in_line import in_series
-from heliograph.random_affine.law import AbstractLaw, Constant
-from heliograph.random_affine.noise import AbstractNoise, as_noise, components
+from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
 @overload
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
@@ -34,8 +34,8 @@ def hop(
 ) -> GainAndNoise: ...
 @overload
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
@@ -45,8 +45,8 @@ def hop(
 
 
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,

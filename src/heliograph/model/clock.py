@@ -74,12 +74,12 @@ class Clocked(AbstractPlant):
 
 
 def with_clocks(
-    plant: AbstractPlant,
-    sensors: Mapping[str, AbstractSensor],
-    clocks: Mapping[str, Clock],
+    plant: "AbstractPlant",
+    sensors: "Mapping[str, AbstractSensor]",
+    clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
     dt: "Float[ArrayLike, '']",
-) -> tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]:
+) -> "tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The

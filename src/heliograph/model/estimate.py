@@ -51,9 +51,9 @@ class Innovation(Module):
             arrived; log N(value; 0, covariance) unless the filter says otherwise.
     """
 
-    value: Float[Array, "... m"]
-    covariance: Float[Array, "... m m"]
-    log_likelihood: Float[Array, "..."]
+    value: "Float[Array, '... m']"
+    covariance: "Float[Array, '... m m']"
+    log_likelihood: "Float[Array, '...']"
 
 
 def weakest(claims: list[Claim]) -> Claim:

@@ -75,10 +75,10 @@ class Network(Module):
     def __init__(
         self,
         plant: AnyPlant,
-        nodes: Mapping[str, Node | Listener],
-        fused: Mapping[str, Fusion | AbstractFilter] | None = None,
-        relays: RelayNetwork | None = None,
-        common: Common | None = None,
+        nodes: "Mapping[str, Node | Listener]",
+        fused: "Mapping[str, Fusion | AbstractFilter] | None" = None,
+        relays: "RelayNetwork | None" = None,
+        common: "Common | None" = None,
     ):
         self.plant, self.relays, self.common, self.single = plant, relays, common, False
         self.nodes = table("nodes", nodes, "nodes")

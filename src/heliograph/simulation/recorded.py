@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_times, fail, instance, table
@@ -27,14 +28,17 @@ from heliograph.smoothing.modes import AbstractSmoothing
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
 
 
+Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
+
+
 def run(
-    network: Network,
-    measurements: Mapping[str, ArrayLike],
+    network: "Network",
+    measurements: "Mapping[str, ArrayLike]",
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     time: Float[ArrayLike, " steps"] | None = None,
-    smooth: AbstractSmoothing | None = None,
-    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
-) -> Record:
+    smooth: "AbstractSmoothing | None" = None,
+    reports: Reports | None = None,
+) -> "Record":
     """Run every filter of the network over recorded measurements.
 
     Values beyond a node's limits, and those that are implausible for all filters of a node

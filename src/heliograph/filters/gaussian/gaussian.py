@@ -185,11 +185,11 @@ def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    transform: AbstractTransform,
-    update: AbstractUpdate | None = None,
+    transform: "AbstractTransform",
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
     Args:
@@ -218,10 +218,10 @@ def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Cubature Kalman filter on its channel's second moments.
 
     Args:
@@ -248,10 +248,10 @@ def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
     Args:

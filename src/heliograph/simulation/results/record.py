@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import fail
@@ -21,6 +22,10 @@ if TYPE_CHECKING:  # extras
     import pandas as pd
     import xarray as xr
     from matplotlib.axes import Axes
+
+
+Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
+Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
 
 
 @readable
@@ -44,11 +49,11 @@ class Record(Saved):
     states: tuple[str, ...]
     truth: np.ndarray | None
     measurements: dict[str, np.ndarray]
-    estimates: dict[str, dict[str, Estimate]]
-    uplinks: dict[str, Uplink] = field(default_factory=dict)
+    estimates: Estimates
+    uplinks: "dict[str, Uplink]" = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
-    reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
+    reports: Reports = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
