@@ -57,3 +57,6 @@ from .description import (
 from .solution import (
     Row as Row,
 )
+from .senders import (
+    SenderFit as SenderFit,
+)

@@ -14,6 +14,7 @@ from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.recordings import gathered
 from heliograph.learning.likelihood.surface import StoppedError, Surface
+from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
 from heliograph.numerics.readable import readable
@@ -127,11 +128,15 @@ def fit(
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Fit:
+) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 
     The likelihood is that of all nodes together. For linear plants the linear form comes first, which is right whatever
     the laws; from there the conditional one, which is sharper. Ctrl-C returns the best so far.
+
+    Behind a sender that decides when to send (`trigger` of a node) the likelihood is that of `event_filter`, silence
+    included; delta and losses are free numbers like others. A heartbeat is a whole number: fit with each that may be,
+    and compare `log_likelihood`. The result is a `SenderFit`.
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
@@ -149,6 +154,8 @@ def fit(
     """
     check_count("starts", starts)
     description = describe(network)
+    if decides(description.start):
+        return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
     data = gathered(description.start, recording, inputs, description.parameters.size)
     # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description)]

@@ -193,7 +193,7 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
 
 
 def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
-    """Powers of the least error within the limits, and the certificate."""
+    """Powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         whole = SplitPaths(*(part[:, problem.path] for part in task.whole()))
