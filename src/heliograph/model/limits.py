@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
-LimitsLike = ArrayLike | Sequence[Sequence[float | None]] | None
+LimitsLike = TypeAliasType("LimitsLike", ArrayLike | Sequence[Sequence[float | None]] | None)
 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":

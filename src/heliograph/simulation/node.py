@@ -55,10 +55,10 @@ class Node(Module):
         self,
         sensor: AnySensor,
         channel: Channel,
-        filters: Mapping[str, AbstractFilter],
+        filters: "Mapping[str, AbstractFilter]",
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
-        trigger: AbstractTrigger | None = None,
+        trigger: "AbstractTrigger | None" = None,
     ):
         self.trigger = trigger
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")

@@ -37,6 +37,8 @@ if TYPE_CHECKING:  # extras
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
+ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
+Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
 Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
 Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
 
@@ -63,13 +65,13 @@ class Record(Saved):
     time: np.ndarray
     states: tuple[str, ...]
     truth: np.ndarray | None
-    measurements: dict[str, np.ndarray]
+    measurements: ByNode
     estimates: Estimates
-    uplinks: "dict[str, Uplink]" = field(default_factory=dict)
+    uplinks: Uplinks = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: Reports = field(default_factory=dict)
-    transmissions: dict[str, np.ndarray] = field(default_factory=dict)
+    transmissions: ByNode = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
