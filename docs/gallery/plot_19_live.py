@@ -48,7 +48,7 @@ for _, message in known:
 
 fig, (top, bottom) = plt.subplots(2, 1, figsize=(9, 5.2), sharex=True, height_ratios=[3, 2], layout="constrained")
 for name, result, color, shift in (
-    ("provisional, as first published", first, "C1", -0.15),
+    ("provisional, at first", first, "C1", -0.15),
     ("final", final, "C0", 0.15),
 ):
     times = np.array(list(result))
@@ -73,7 +73,7 @@ bottom.legend(fontsize=8, ncols=3, loc="upper center")
 
 # %%
 # Both kinds are honest. A provisional estimate knows less, and says so: its bar is longer. The final one is that of a
-# filter that has received everything that came within the window, in the order of time. A copy changes nothing, and what
+# filter that received all that came within the window, in the order of time. A copy changes nothing, and what
 # comes later than the window is refused. Each of them is published, with the reason.
 
 print(json.dumps(next(item for _, item in known if item.get("reason") == "late"), indent=1))
