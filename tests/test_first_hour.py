@@ -8,7 +8,7 @@ import heliograph as hg
 
 
 def test_three_rooms_with_quantized_links(tmp_path):
-    """Three rooms warm each other and lose heat; the thermometer of each is heard by a small computer that sends its
+    """Three rooms warm each other and lose heat; the thermometer of each is received by a small computer that sends its
     estimate of all three temperatures with few symbols. How warm is the house, and how wrong may that be?"""
     house = hg.LinearPlant(
         0.9 * np.eye(3) + 0.03 * (np.ones((3, 3)) - np.eye(3)),  # of what is above the outside, each minute

@@ -52,7 +52,7 @@ def case(name):
 
 
 def random_case(seed, nodes=3, n=3):
-    """A random plant with a mean, and nodes that hear one or two numbers; some hear the same."""
+    """A random plant with a mean, and nodes that receive one or two numbers; some receive the same."""
     draw = np.random.default_rng(seed)
     matrix = draw.normal(size=(n, n)) / np.sqrt(n)
     root = draw.normal(size=(n, n))

@@ -1,4 +1,4 @@
-"""Losses that are told: a claim for each pattern of losses, every pattern of a small case enumerated."""
+"""Observed losses: a claim for each pattern of losses, every pattern of a small case enumerated."""
 
 from itertools import product
 

@@ -19,7 +19,7 @@ TURNED, SAME = [1, 0, 2], np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0]])
 
 
 def drawn(seed, growth):
-    """Plant, sensor noise, shared hop and own hops; node 3 hears what node 2 hears, bit for bit."""
+    """Plant, sensor noise, shared hop and own hops; node 3 receives what node 2 receives, bit for bit."""
     draw = np.random.default_rng(seed)
     matrix = draw.normal(size=(2, 2))
     matrix *= growth / np.abs(np.linalg.eigvals(matrix)).max()
@@ -34,7 +34,7 @@ def drawn(seed, growth):
 
 
 def network(d, rules, order=(0, 1, 2)):
-    """Two sensors with correlated noise, one hop for both, a hop to each node, of which the second is heard twice.
+    """Two sensors with correlated noise, one hop for both, a hop to each node, of which the second is received twice.
 
     The first node's filter trusts the mean gain and starts where it likes: its gains are not the best.
     """

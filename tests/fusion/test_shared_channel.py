@@ -87,5 +87,5 @@ def test_monte_carlo_agrees():
 def test_all_outputs_are_heard_once():
     net = shared_network({})
     filters = {"alone": net.nodes["node 0"].filters}
-    with pytest.raises(ValueError, match="to hear its 2 outputs, each once"):
+    with pytest.raises(ValueError, match="to receive its 2 outputs, each once"):
         hg.Network.sharing(net.plant, net.common.sensor, net.common.channel, filters)

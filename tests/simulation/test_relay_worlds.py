@@ -119,7 +119,7 @@ def test_what_holds_for_every_network_holds_for_relays(designed, recorded):
 
 
 def quiet():
-    """One relay, which listens and talks in turn, so that the receiver hears it every other step."""
+    """One relay, which listens and talks in turn, so that the receiver receives it every other step."""
     hops = hop(0.9, 0.1), hop(0.8, 0.2)
     slots = [{"a": {"sensor": hops[0]}}, {"receiver": {"a": hops[1]}}]
     plant = LinearPlant([[0.95]], [[1.0]], [1.0], [[2.0]])
@@ -197,7 +197,7 @@ def staying(noise):
 
 
 def test_hops_that_remember_keep_their_state():
-    """Without noise, what is heard over what was sent is one number for each run and hop."""
+    """Without noise, what is received over what was sent is one number for each run and hop."""
     plant = LinearPlant([[1.0]], [[0.0]], [1.0], [[1.0]])
     sensor = LinearSensor([[1.0]], [[0.0]])
     node = Network(plant, {"n": Node(sensor, staying(0.0), {})})

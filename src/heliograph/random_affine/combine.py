@@ -210,7 +210,7 @@ class Mixture(_Parts):
 
 
 class Stack(_Parts):
-    """Independent maps that hear the same y, their outputs one above the other; moments are products of polynomials."""
+    """Stack of independent maps of the same y, outputs one above the other; moments are products of polynomials."""
 
     maps: tuple[AbstractRandomAffine, ...]
 

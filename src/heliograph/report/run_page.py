@@ -106,7 +106,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
         KeyFigure(
-            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could hear", GREEN
+            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could receive", GREEN
         ),
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]

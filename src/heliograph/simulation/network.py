@@ -203,7 +203,7 @@ class Network(Module):
         }
         if sum(received.values()) != first(channel).outputs:
             raise fail(
-                "nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", received
+                "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
             )
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
         for name, filter_ in filters.items():
@@ -295,7 +295,7 @@ class Network(Module):
         # An informed rule: it needs the joint moments of the errors.
         known = self.parts_of(item.filter)
         if len(known) < len(local):
-            raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
+            raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
         if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
                        type(next(iter(known.values()))[2]).__name__)  # fmt: skip

@@ -269,7 +269,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
         observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
-        raise fail("fusion", f"one of {observation}, which hear reports", repr(name))
+        raise fail("fusion", f"one of {observation}, which receive reports", repr(name))
     # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
     alone = Network(

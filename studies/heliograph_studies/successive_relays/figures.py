@@ -19,7 +19,7 @@ TITLES = {
     "lmmse_tuned": "the same, searched from another start", "lmmse_quiet": "the same, at the paper's power",
     "no_relay": "no relay: one hop, as late", "sensor_itself": "no relay, no channel: as late",
     "no_relay_filtered": "no relay: one hop, without delay",
-    "sensor_itself_filtered": "no relay, no channel: without delay", "nothing_heard": "nothing heard",
+    "sensor_itself_filtered": "no relay, no channel: without delay", "nothing_received": "nothing received",
 }  # fmt: skip
 UNITS = ("V", "V", "A")
 

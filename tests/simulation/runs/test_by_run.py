@@ -48,7 +48,7 @@ def test_every_run_is_the_one_that_a_loop_makes():
 
 
 def world(plain):
-    """Two nodes that hear everything and one that loses half of it."""
+    """Two nodes that receive everything and one that loses half of it."""
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     nodes = {}
     for name, gain, channel in (("a", 1.0, plain), ("b", 0.3, plain), ("lost", 1.0, hg.erasure(plain, 0.5))):
