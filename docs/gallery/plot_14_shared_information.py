@@ -18,10 +18,10 @@ link = hg.hop(hg.Discrete([0.6, 1.0], [0.5, 0.5]), noise=0.05)
 nodes = {}
 for name, row in {"kitchen": [1.0, 0.0], "hall": [0.0, 1.0]}.items():
     sensor = hg.LinearSensor([row], 0.1)
-    nodes[name] = hg.Node(sensor, link, {"own": hg.linear_filter(rooms, sensor, link)})
+    nodes[name] = hg.Node(sensor, link, {"local": hg.linear_filter(rooms, sensor, link)})
 fused = {
-    "best weights": hg.Fusion("own", hg.fusion.MatrixWeights()),
-    "memory of\nall reports": hg.Fusion("own", hg.fusion.AllReports()),
+    "best weights": hg.Fusion("local", hg.fusion.MatrixWeights()),
+    "memory of\nall reports": hg.Fusion("local", hg.fusion.AllReports()),
 }
 network = hg.Network(rooms, nodes, fused)
 horizon = 30
@@ -30,7 +30,7 @@ horizon = 30
 traces = {}
 local = {}
 for name, node in nodes.items():
-    error = hg.filters.true_error(node.filters["own"], rooms, node.sensor, link, horizon)
+    error = hg.filters.true_error(node.filters["local"], rooms, node.sensor, link, horizon)
     local[name] = hg.model.Estimate(np.zeros(2), error.claimed[-1], "exact")
     traces[f"{name}\nalone"] = np.trace(error.true[-1])
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
-from heliograph.report.health import Health, Listening
+from heliograph.report.health import FilterHealth, Health
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.results.record import Record
@@ -45,7 +45,7 @@ def _nodes(record: Record) -> list[str]:
     return [node for node, filters in record.estimates.items() if filters][:MOST]
 
 
-def _tested(health: Health) -> list[Listening]:
+def _tested(health: Health) -> list[FilterHealth]:
     return [filter_ for filter_ in health.filters if filter_.white is not None][:MOST]
 
 
@@ -60,7 +60,7 @@ def _estimates(health: Health, record: Record, node: str) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
-def _innovations(health: Health, tested: list[Listening]) -> Figure:
+def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
     for axes, item in zip(grid, tested, strict=True):

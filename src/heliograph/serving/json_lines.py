@@ -8,7 +8,7 @@ from heliograph.filters.plausibility import in_words
 from heliograph.serving.lanes import Lanes, Place
 
 
-class Teller:
+class OutputWriter:
     """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
 
     def __init__(self, lanes: Lanes):

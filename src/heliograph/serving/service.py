@@ -11,7 +11,7 @@ from typing import NamedTuple
 from heliograph.live.event import Verdict
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
-from heliograph.serving.json_lines import Teller, line
+from heliograph.serving.json_lines import OutputWriter, line
 from heliograph.serving.message import Message, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
@@ -60,7 +60,7 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
-        self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
+        self._writer, self._using = OutputWriter(fleet.lanes), Using(fleet, self.plants)
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
@@ -206,7 +206,7 @@ class Service:
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
-        return self._teller.estimates(kind, plant.name, moment, outputs)
+        return self._writer.estimates(kind, plant.name, moment, outputs)
 
 
 @contextmanager

@@ -28,8 +28,8 @@ from heliograph.simulation.centres.centre import along_estimates, informed_claim
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import (
     Common,
-    Listener,
     Node,
+    ReceivingNode,
     check_filters,
     check_received,
     check_sizes,
@@ -40,7 +40,7 @@ from heliograph.simulation.node import (
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
-LOCAL = "own"  # a relay's one filter
+LOCAL = "local"  # a relay's one filter
 
 
 class Kind(NamedTuple):
@@ -72,7 +72,7 @@ class Network(Module):
     """
 
     plant: AnyPlant
-    nodes: dict[str, Node | Listener]
+    nodes: dict[str, Node | ReceivingNode]
     fused: dict[str, Fusion | AbstractFilter]
     relays: RelayNetwork | None
     common: Common | None
@@ -84,7 +84,7 @@ class Network(Module):
     def __init__(
         self,
         plant: AnyPlant,
-        nodes: "Mapping[str, Node | Listener]",
+        nodes: "Mapping[str, Node | ReceivingNode]",
         fused: "Mapping[str, Fusion | AbstractFilter] | None" = None,
         relays: "RelayNetwork | None" = None,
         common: "Common | None" = None,
@@ -99,7 +99,7 @@ class Network(Module):
         # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
+            check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
             for filter_, element in node.filters.items():
                 check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
@@ -141,7 +141,7 @@ class Network(Module):
 
         At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
         draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
-        the relays, each with a single filter "own", and "receiver". A recording may leave out what a relay received.
+        the relays, each with a single filter "local", and "receiver". A recording may leave out what a relay received.
 
         Args:
             relays: the relays' slots and hops.
@@ -168,7 +168,7 @@ class Network(Module):
         outputs = tuple(first(relays.sensor).outputs)
         # All places receive sums of hops.
         nodes = {
-            name: Listener(filters[name], item, outputs, relays.always_receives(name))
+            name: ReceivingNode(filters[name], item, outputs, relays.always_receives(name))
             for name, item in zip(relays.filters, relays.received, strict=True)
         }
         return Network(relays.plant, nodes, relays=relays)
@@ -208,7 +208,9 @@ class Network(Module):
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
         for name, filter_ in filters.items():
             check_filters(filter_, received[name])
-        nodes = {name: Listener(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()}
+        nodes = {
+            name: ReceivingNode(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()
+        }
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
     def rows(self) -> dict[str, np.ndarray]:
@@ -316,14 +318,14 @@ class Network(Module):
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 
 
-def _world(node: Node | Listener) -> object:
+def _world(node: Node | ReceivingNode) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
         return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
 
 
-def claim_at(node: Node | Listener, item: AbstractFilter) -> Claim:
+def claim_at(node: Node | ReceivingNode, item: AbstractFilter) -> Claim:
     """Claim of a filter at a node."""
     return node.claim_of(item) if isinstance(node, Node) else item.claim
 

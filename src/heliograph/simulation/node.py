@@ -124,7 +124,7 @@ class Node(Module):
 
 
 @readable
-class Listener(Module):
+class ReceivingNode(Module):
     """A place in a network of relays, which receives from relays or the sensor, and its filters.
 
     `received` numbers named after `outputs` arrive, always all of them if it is `complete`.

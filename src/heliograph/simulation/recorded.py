@@ -20,7 +20,7 @@ from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters
@@ -98,7 +98,7 @@ def run(
     return found_record(network, part, result, clock)
 
 
-def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Measurements without those beyond their node's limits, which are warned of."""
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z

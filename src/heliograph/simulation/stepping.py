@@ -31,7 +31,7 @@ from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
 from heliograph.smoothing.backward_pass import planned_with_past
 
@@ -295,7 +295,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     )
 
 
-def _with_only(node: Node | Listener, name: str) -> Node | Listener:
+def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
     filters = {single: item for single, item in node.filters.items() if single == name}
     if isinstance(node, Node):

@@ -25,7 +25,7 @@ RULES = {
     "matrix_with_mean": hg.fusion.MatrixWeights(with_mean=True),
     "all_reports": hg.fusion.AllReports(),
 }
-LOCAL = "own"  # the filter of each node
+LOCAL = "local"  # the filter of each node
 
 
 @dataclass(frozen=True)

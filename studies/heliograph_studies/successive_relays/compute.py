@@ -190,7 +190,7 @@ def world(network: hg.model.RelayNetwork, design: RelayDesign) -> hg.Network:
     """The relays with their filters, and the receiver's."""
     schedules = hg.relays.relay_schedules(network, design)
     receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
-    return hg.Network.of_relays(network, schedules, {"own": receiver})
+    return hg.Network.of_relays(network, schedules, {"local": receiver})
 
 
 def initial_states(setting: Setting) -> np.ndarray:
@@ -210,7 +210,7 @@ def simulate(setting: Setting, design: RelayDesign, stages: Stages) -> Simulated
     start = np.sum((initial_states(setting) - network.initial()[0]) ** 2, axis=1)
     mean, error = {}, {}
     for name in FILTERS:
-        statistics = sums[name]["own"]
+        statistics = sums[name]["local"]
         batches = np.trace(statistics.outer, axis1=2, axis2=3) / statistics.count[:, None]
         weights = statistics.count / statistics.count.sum()
         mean[name] = np.concatenate([[start.mean()], weights @ batches])

@@ -36,7 +36,9 @@ def _trajectory(result: Outcome, i: int) -> Figure:
     assert result.shown.truth is not None
     curves = [Curve("true", INK, result.shown.truth[0, :, i])]
     for name in FILTERS:
-        curves.append(Curve(LABELS[name], COLOURS[name], np.asarray(result.shown.estimates[name]["own"].mean)[0, :, i]))
+        curves.append(
+            Curve(LABELS[name], COLOURS[name], np.asarray(result.shown.estimates[name]["local"].mean)[0, :, i])
+        )
     label = f"{STATES[i].replace('_', ' ')} ({UNITS[i]})"
     return curves_over_time(result.shown.time, [Panel(label, curves)], "step k")
 

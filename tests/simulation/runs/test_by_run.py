@@ -81,7 +81,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
 def test_columns_of_what_relays_heard_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, own_error_design(net, 4))
-    receivers = {"own": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
+    receivers = {"local": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
     network = hg.Network.of_relays(net, schedules, receivers)
     z = np.linspace(0.1, 0.4, 4)
     columns = {"time": np.arange(4.0), "receiver.y0": z}
