@@ -60,8 +60,8 @@ def serve(
     # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    store_ = store_of(network, store, parts)
+    opened = store_of(network, store, parts)
     settings = ServiceSettings(
-        load_network(network), options, store_, process, from_snapshot, where, parts, page, tuple(anew or ())
+        load_network(network), options, opened, process, from_snapshot, where, parts, page, tuple(anew or ())
     )
     asyncio.run(run(settings))

@@ -140,8 +140,8 @@ def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) 
         return np.broadcast_to(item, (steps, *item.shape))
     if value.steps < steps:
         raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
-    values_: np.ndarray = array(name, value.values, (None, *shape))
-    return values_[:steps]
+    matrices: np.ndarray = array(name, value.values, (None, *shape))
+    return matrices[:steps]
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:

@@ -69,8 +69,8 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
-        for filter_ in self.filters:
-            lines += _doubts(filter_)
+        for tested_filter in self.filters:
+            lines += _doubts(tested_filter)
         return lines
 
 

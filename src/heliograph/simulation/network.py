@@ -100,8 +100,8 @@ class Network(Module):
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
             check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
-            for filter_, element in node.filters.items():
-                check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
+            for label, element in node.filters.items():
+                check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -199,17 +199,17 @@ class Network(Module):
         check_forgets("channel of nodes that share it", first(channel))
         # Each output goes to one node.
         received = {
-            name: max((item.received for item in filter_.values()), default=0) for name, filter_ in filters.items()
+            name: max((item.received for item in by_name.values()), default=0) for name, by_name in filters.items()
         }
         if sum(received.values()) != first(channel).outputs:
             raise fail(
                 "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
             )
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
-        for name, filter_ in filters.items():
-            check_filters(filter_, received[name])
+        for name, by_name in filters.items():
+            check_filters(by_name, received[name])
         nodes = {
-            name: ReceivingNode(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()
+            name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
         }
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 

@@ -117,8 +117,8 @@ class AdaptiveFilter(AbstractFilter):
     @in_float64
     def estimate(self, state: AdaptiveBelief) -> Estimate:
         """The filter's own."""
-        estimate_ = self.base.estimate(Belief(state.mean, state.covariance))
-        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+        posterior = self.base.estimate(Belief(state.mean, state.covariance))
+        return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
         """Noise variances of what arrives, b / a, of one state or of several stacked."""

@@ -67,8 +67,8 @@ class SequentialFilter(AbstractFilter):
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
         """Mean and covariance of the belief, by the first node's filter."""
-        estimate_ = self.filters[0].estimate(state)
-        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+        posterior = self.filters[0].estimate(state)
+        return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step

@@ -96,17 +96,17 @@ class PlannedFilter(AbstractFilter):
         before: PlannedMean,
         prior: PlannedMean,
         after: PlannedMean,
-        innovation_: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
         """Return the planned smoother step with the mean and the innovation of these data."""
         if self.past is None:
-            return super().smoother_step(before, prior, after, innovation_, z, u, k)
+            return super().smoother_step(before, prior, after, innovation, z, u, k)
         p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
-        innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
-        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
+        residual = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
+        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), residual)
 
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """Return the filter with smoother steps, which are the same for all data."""

@@ -67,9 +67,9 @@ class PartFilter(AbstractFilter):
         """Mean and covariance of the first states after step k."""
         return self._part(self.base.after_step(state, k))
 
-    def _part(self, estimate_: Estimate) -> Estimate:
+    def _part(self, whole: Estimate) -> Estimate:
         n = len(self.states)
-        return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
+        return Estimate(whole.mean[..., :n], whole.covariance[..., :n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all that does not depend on data."""

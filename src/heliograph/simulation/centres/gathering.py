@@ -23,6 +23,7 @@ from heliograph.simulation.centres.centre import (
     Together,
     along_estimates,
     described,
+    observation_model,
 )
 from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.linearised import LinearisedCentre

@@ -122,8 +122,8 @@ class Record(Saved):
         # Estimates and measurements with their places.
         results = [
             ((nodes.index(node), filters.index(name)), estimate)
-            for node, estimate_ in self.estimates.items()
-            for name, estimate in estimate_.items()
+            for node, by_name in self.estimates.items()
+            for name, estimate in by_name.items()
         ]
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         most = max((z.shape[-1] for _, z in received), default=0)
