@@ -36,16 +36,16 @@ def levels_of(value: int) -> Float[np.ndarray, ""]:
 def parameter(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter as a number, or as one number per component."""
     several = isinstance(value, Sequence) or np.ndim(value) > 0
-    result: Parameter = array(name, value, (None,) if several else ())
-    return result
+    numbers: Parameter = array(name, value, (None,) if several else ())
+    return numbers
 
 
 def positive(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter that is positive."""
-    result = parameter(name, value)
-    if not isinstance(result, jax.Array) and np.any(result <= 0):
+    checked = parameter(name, value)
+    if not isinstance(checked, jax.Array) and np.any(checked <= 0):
         raise fail(name, "positive numbers", value)
-    return result
+    return checked
 
 
 def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:

@@ -66,8 +66,8 @@ def hop(
     count = components(noise) or check_count("dimension of a hop", dimension)
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
-    result = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
-    return result if delay is None else Delayed(result, delay)
+    radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
+    return radio_hop if delay is None else Delayed(radio_hop, delay)
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:

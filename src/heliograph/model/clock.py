@@ -47,11 +47,11 @@ class Stamped(AbstractSensor):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x) - o dh/dt; h(x) where the clock is right."""
-        local = jnp.asarray(x)[: self.states]
+        state = jnp.asarray(x)[: self.states]
         if self.motion is None:
-            return self.base.measure(local)
-        rate = jnp.asarray(self.motion(local) if callable(self.motion) else jnp.asarray(self.motion) @ local)
-        y, change = jax.jvp(self.base.measure, (local,), (rate,))
+            return self.base.measure(state)
+        rate = jnp.asarray(self.motion(state) if callable(self.motion) else jnp.asarray(self.motion) @ state)
+        y, change = jax.jvp(self.base.measure, (state,), (rate,))
         return jnp.asarray(y - x[self.offset] * change)
 
 

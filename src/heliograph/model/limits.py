@@ -65,10 +65,10 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
         raise fail("limits", expected, shown(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
     pairs = [[end if item is None else item for item, end in zip(row, everything, strict=True)] for row in rows]
-    result = _numbers("limits", pairs, expected)
-    if np.any(~(result[:, 0] < result[:, 1])):
+    intervals = _numbers("limits", pairs, expected)
+    if np.any(~(intervals[:, 0] < intervals[:, 1])):
         raise fail("limits", "a low end below the high one", shown(limits))
-    return result
+    return intervals
 
 
 def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:

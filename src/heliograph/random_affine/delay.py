@@ -173,8 +173,8 @@ def of_line(channel: T) -> T:
     def plain(part: object) -> object:
         return part.line if isinstance(part, AbstractOfLine) else part
 
-    result: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
-    return result
+    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
+    return without_line
 
 
 def sent(channel: AbstractRandomAffine) -> int:

@@ -43,10 +43,10 @@ def long_run(modes: JointModes) -> np.ndarray:
 
 def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
     """Law of the mode at each step."""
-    result = [np.asarray(steps[0].initial)]
+    laws_by_step = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
-        result.append(result[-1] @ np.asarray(step.transition))
-    return result
+        laws_by_step.append(laws_by_step[-1] @ np.asarray(step.transition))
+    return laws_by_step
 
 
 def harmless(steps: Sequence[JointModes], constant: bool) -> bool:

@@ -220,8 +220,8 @@ def _laguerre(order: int, x: Scalar) -> Scalar:
         before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
     while v < order / 2:
         before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
-    result: Scalar = now
-    return result
+    moment: Scalar = now
+    return moment
 
 
 class Nakagami(AbstractLaw):

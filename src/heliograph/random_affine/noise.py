@@ -174,9 +174,9 @@ class Independent(AbstractNoise):
         value: Number = 1.0
         start = 0
         for part in self.parts:
-            local = tuple(powers[start : start + part.dimension])
+            part_powers = tuple(powers[start : start + part.dimension])
             start += part.dimension
-            value *= part.moment(local) if any(local) else 1.0
+            value *= part.moment(part_powers) if any(part_powers) else 1.0
         return value
 
 
@@ -216,12 +216,12 @@ class Shaped(AbstractNoise):
 
 def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
     """Coefficients of p(u) sum_j row_j u_j."""
-    result: dict[Exponents, Number] = {}
+    raised_polynomial: dict[Exponents, Number] = {}
     for a, c in polynomial.items():
         for j in (j for j, entry in enumerate(row) if not is_zero(entry)):
             raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            result[raised] = result.get(raised, 0.0) + c * plain(row[j])
-    return result
+            raised_polynomial[raised] = raised_polynomial.get(raised, 0.0) + c * plain(row[j])
+    return raised_polynomial
 
 
 NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance

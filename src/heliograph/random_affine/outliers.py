@@ -57,8 +57,8 @@ class StudentT(AbstractNoise):
         if not is_traced(nu) and nu <= 2:
             expected = "more than 2, below which it has no covariance (robust_filter with its score update needs none)"
             raise fail("degrees of Student's law", expected, f"{float(nu):g}")
-        result: Square = self.scale * (nu / (nu - 2))
-        return result
+        total: Square = self.scale * (nu / (nu - 2))
+        return total
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw A w / sqrt(l), w standard normal."""
@@ -219,8 +219,8 @@ def precision_shares(degrees: ArrayLike) -> Vector:
     below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half, between.shape), between * half)
     masses = xp.diff(xp.concatenate([np.zeros(1), below, np.ones(1)]))
     masses = xp.maximum(masses, LEAST_SHARE)
-    result: Vector = masses / xp.sum(masses)
-    return result
+    shares: Vector = masses / xp.sum(masses)
+    return shares
 
 
 class Nominal(NamedTuple):
@@ -302,8 +302,8 @@ def _log(value: Vector) -> Vector:
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):
-        result: Vector = np.log(np.maximum(value, 0.0))
-    return result
+        logarithm: Vector = np.log(np.maximum(value, 0.0))
+    return logarithm
 
 
 def _stacked(parts: list[Branches]) -> Branches:

@@ -73,10 +73,10 @@ class GaussianFilter(AbstractBeliefFilter):
             return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
         observed_of = observed_through(channel.mean_gain, sensor.matrix)
         process = plant.noise_covariance(jnp.asarray(u))
-        result = linear_smoother_step(
+        step = linear_smoother_step(
             after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
         )
-        return replace(result, angles=plant.angles)
+        return replace(step, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

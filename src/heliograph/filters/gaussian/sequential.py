@@ -74,9 +74,9 @@ class SequentialFilter(AbstractFilter):
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
         """Return the moments around all nodes' updates."""
-        item = self.filters[0]
-        cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, self.claim, first(item.plant).angles)
+        head = self.filters[0]
+        cross = predicted(at(head.plant, k), head.transform, before, jnp.asarray(u)).cross
+        return moments_smoother_step(after, prior, cross, self.claim, first(head.plant).angles)
 
 
 def _joined(parts: Sequence[Innovation]) -> Innovation:

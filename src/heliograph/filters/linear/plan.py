@@ -127,7 +127,7 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
 
 
 def plan(
-    item: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
+    filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
     """Run a filter over complete data and record its matrices; its state has a `mean` and a `covariance`.
 
@@ -137,7 +137,7 @@ def plan(
     Raises:
         ValueError: inputs of another number than the filter's.
     """
-    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), projection)
+    return _plan(filter, array("inputs", inputs, (None, len(filter.inputs))), projection)
 
 
 @compiled
