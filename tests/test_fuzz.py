@@ -60,7 +60,7 @@ CALLS = [  # what is called, and arguments with which it works
     (hg.Network, {"plant": PLANT, "nodes": {"a": NODE}, "fused": {"c": hg.Fusion("f", hg.fusion.EqualIntersection())}}),
     (hg.Network.of_relays, {"relays": RELAYS, "schedules": {}, "receivers": {}}),
     (hg.Node, {"sensor": SENSOR, "channel": hg.perfect(), "filters": {"f": KALMAN}}),
-    (hg.Stream, {"filter_": KALMAN}),
+    (hg.Stream, {"filter": KALMAN}),
     (hg.Stream(KALMAN).push, {"measurement": [0.0], "inputs": ()}),
     (hg.log_likelihood, {"filter": KALMAN, "measurements": np.zeros((2, 1)), "inputs": None}),
     (model.mean_gain, {"channel": HOP}),
