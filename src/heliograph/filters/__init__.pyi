@@ -14,6 +14,8 @@ from .gaussian.correction import (
 )
 from .wrappers.delay import (
     late_filter as late_filter,
+)
+from .wrappers.part import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (
