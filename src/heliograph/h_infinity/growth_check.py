@@ -318,11 +318,11 @@ def _sharpened(
             [_bounds(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
         )
         seen += len(bottoms)
-        open_ = bounds > goal
-        done = max(done, float(np.max(bounds[~open_], initial=0.0)))
-        if seen + 2 * np.count_nonzero(open_) > LIMIT:
+        undecided = bounds > goal
+        done = max(done, float(np.max(bounds[~undecided], initial=0.0)))
+        if seen + 2 * np.count_nonzero(undecided) > LIMIT:
             return max(done, float(np.max(bounds)))
-        bottoms, tops = _halved(bottoms[open_], tops[open_], high - low)
+        bottoms, tops = _halved(bottoms[undecided], tops[undecided], high - low)
     return done
 
 
