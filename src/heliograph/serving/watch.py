@@ -14,6 +14,7 @@ from scipy.special import gammaincinv
 from heliograph.live.event import VERDICTS
 from heliograph.model.estimate import Claim
 from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
@@ -270,7 +271,7 @@ class Watched:
         """Return the service's unpublished outputs."""
         return self.service.unpublished()
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, and record its outputs."""
         with self.watch.lock:
             outputs = self.service.take(payloads)

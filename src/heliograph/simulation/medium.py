@@ -72,6 +72,13 @@ class NodeGroup(Module):
     place: tuple[int, int] | None = eqx.field(static=True)
 
 
+class Silent(Module):
+    """Nodes without a sensor."""
+
+    count: int = eqx.field(static=True)
+    place: None = eqx.field(static=True, default=None)
+
+
 class LinkState(NamedTuple):
     """State of a channel, of its sender, and the estimate (n,) last fed back to the sensor, each None without."""
 
@@ -83,7 +90,7 @@ class LinkState(NamedTuple):
 class SeparateChannels(AbstractMedium):
     """Nodes with a sensor and a channel each."""
 
-    groups: tuple[NodeGroup, ...]
+    groups: tuple[NodeGroup | Silent, ...]
 
     def init(self, key: jax.Array) -> PyTree:
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
@@ -94,7 +101,8 @@ class SeparateChannels(AbstractMedium):
             sender = None if group.trigger is None else group.trigger.start(outputs)
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
 
-        return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
+        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))
+        return tuple(() if isinstance(group, Silent) else both(group) for group in self.groups)
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
@@ -122,7 +130,10 @@ class SeparateChannels(AbstractMedium):
             return LinkState(memory, reach.feed_back, sender), z
 
         both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0))
-        results = [both(group, reach) for group, reach in zip(self.groups, state, strict=True)]
+        results = [
+            (reach, jnp.zeros((group.count, 0))) if isinstance(group, Silent) else both(group, reach)
+            for group, reach in zip(self.groups, state, strict=True)
+        ]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
@@ -134,7 +145,8 @@ class SeparateChannels(AbstractMedium):
 
     def reasons(self, state: PyTree) -> dict[str, jax.Array]:
         """Return the reasons for which senders that decide transmitted at this step, by group, (node, m)."""
-        return {str(g): reach.sender.last for g, reach in enumerate(state) if reach.sender is not None}
+        links = ((g, reach) for g, reach in enumerate(state) if isinstance(reach, LinkState))
+        return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
 
 
 def _first_mean(item: AbstractFilter) -> jax.Array:
@@ -290,10 +302,14 @@ def medium_of(network: Network) -> AbstractMedium:
         received = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
-    groups, places = [], network.places()
+    groups: list[NodeGroup | Silent] = []
+    places = network.places()
     local = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in local.items()})
     for names in network.groups:
+        if names[0] not in local:
+            groups.append(Silent(len(names)))
+            continue
         parts = stack([(local[name].sensor, _unnamed(local[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])

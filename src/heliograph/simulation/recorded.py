@@ -26,7 +26,7 @@ from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoo
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
-Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
+Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
 Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
@@ -54,8 +54,9 @@ def run(
         time: (steps,), stored in the record; 0, 1, ... by default.
         smooth: smoothing as in `monte_carlo`; None by default.
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
-            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be
-            left out where the uplinks are deterministic.
+            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
+            fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
+            message did not arrive. They may be left out where the links are deterministic.
 
     Returns:
         The record, without truth.
@@ -90,9 +91,11 @@ def run(
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
         given = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = {
+        arrivals: dict[str, PyTree] = {
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
+        } | {
+            name: mesh.edges.recorded(name, mesh.nodes, given.get(name), steps) for name, mesh in filters.meshes.items()
         }
         result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
     return found_record(network, part, result, clock)
@@ -141,6 +144,9 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 def _filtered(*arguments: PyTree) -> PyTree:
     """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
+    filters = arguments[0]
+    if filters.meshes:  # nodes by the hundred are no straight-line code
+        return to_numpy(_by_xla(*arguments))
     choice = chosen(_run_filters, arguments, [False] * len(arguments))
     if choice.code is None:
         return to_numpy(_by_xla(*arguments))
