@@ -63,12 +63,12 @@ def serve(
     # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    store_ = store_of(network, store, parts)
+    opened = store_of(network, store, parts)
     loaded, module = load_module(network)
     settings = ServiceSettings(
         loaded,
         options,
-        store_,
+        opened,
         process,
         from_snapshot,
         where,

@@ -95,11 +95,11 @@ class AbstractWeights(AbstractInformedFusion):
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Weight the present estimates."""
-        result = happened.errors
-        unbiased, joint = jnp.asarray(means) + result.bias, result.joint
+        errors = happened.errors
+        unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            unbiased = jnp.concatenate([unbiased, result.mean[None]])
-            joint = with_mean(result)
+            unbiased = jnp.concatenate([unbiased, errors.mean[None]])
+            joint = with_mean(errors)
         chosen = self.weights(joint)
         # W sums to I: of differences, since digits that W lacks would count against the size of the means.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])

@@ -384,8 +384,8 @@ class Fusion(Module):
         """Claim of the fused covariance, from the claims of the filters."""
         if self.quantizer is None:
             return self.rule.claim(claims)
-        item = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
-        kind = item.values if isinstance(item, OverTime) else item
+        quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
+        kind = quantizer.values if isinstance(quantizer, OverTime) else quantizer
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:

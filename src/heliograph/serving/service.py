@@ -25,7 +25,7 @@ from heliograph.serving.storage.store_protocol import ConflictError, Entry, Stor
 from heliograph.serving.using import Using
 
 
-class Teller:
+class OutputWriter:
     """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
 
     def __init__(self, lanes: Lanes):
@@ -107,7 +107,7 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
-        self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
+        self._writer, self._using = OutputWriter(fleet.lanes), Using(fleet, self.plants)
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
@@ -263,7 +263,7 @@ class Service:
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
         senders = self.fleet.senders(plant) if kind == "provisional" else {}
-        return self._teller.estimates(kind, plant.name, moment, outputs, senders)
+        return self._writer.estimates(kind, plant.name, moment, outputs, senders)
 
 
 @contextmanager

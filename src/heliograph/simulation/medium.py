@@ -56,9 +56,9 @@ class AbstractMedium(Module):
 class NodeGroup(Module):
     """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
-    `teller`: the filters that are fed back to the sensors, whose estimates stand at `place` (kind, filter) among all.
+    `reference_filter`: the filters that are fed back to the sensors; their estimates stand at `place` (kind, filter).
 
-    `trigger`: when they send; its prediction is that of a filter too, the `teller`.
+    `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`.
 
     Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
     """
@@ -67,7 +67,7 @@ class NodeGroup(Module):
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
-    teller: FedBackFilter | EventFilter | StochasticEventFilter | None
+    reference_filter: FedBackFilter | EventFilter | StochasticEventFilter | None
     trigger: AbstractTrigger | None
     place: tuple[int, int] | None = eqx.field(static=True)
 
@@ -96,7 +96,7 @@ class SeparateChannels(AbstractMedium):
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
 
         def single(group: NodeGroup) -> LinkState:
-            feed_back = None if group.teller is None else _first_mean(group.teller)
+            feed_back = None if group.reference_filter is None else _first_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
@@ -112,15 +112,19 @@ class SeparateChannels(AbstractMedium):
         def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             sensor = at(group.sensor, k)
             y = sensed(sensor, x, draw_key(key, k, group.checksums, SENSOR))
-            if isinstance(group.teller, FedBackFilter) and reach.feed_back is not None:
-                y = y - group.teller.reference(reach.feed_back, u, k)
+            if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
+                y = y - group.reference_filter.reference(reach.feed_back, u, k)
             memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
             if group.trigger is None or reach.sender is None:
                 return LinkState(memory, reach.feed_back), z
             # The sender decides, by its own reference.
             sender = reach.sender
-            if group.trigger.reference == "prediction" and group.teller is not None and reach.feed_back is not None:
-                sender = sender._replace(reference=group.teller.reference(reach.feed_back, u, k))
+            if (
+                group.trigger.reference == "prediction"
+                and group.reference_filter is not None
+                and reach.feed_back is not None
+            ):
+                sender = sender._replace(reference=group.reference_filter.reference(reach.feed_back, u, k))
             drawn = draw_key(key, k, group.checksums, TRIGGER)
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
             return LinkState(memory, reach.feed_back, sender), z
@@ -310,11 +314,13 @@ def medium_of(network: Network) -> AbstractMedium:
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])
         informed_by = local[names[0]].informed_by or local[names[0]].predictor
-        teller: PyTree = None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+        reference_filter: PyTree = (
+            None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+        )
         place = None if informed_by is None else places[names[0], informed_by][:2]
         triggers: PyTree = [local[name].trigger for name in names]
         trigger = None if triggers[0] is None else stack(triggers)
-        groups.append(NodeGroup(*parts, checksums, held, teller, trigger, place))
+        groups.append(NodeGroup(*parts, checksums, held, reference_filter, trigger, place))
     return SeparateChannels(tuple(groups))
 
 

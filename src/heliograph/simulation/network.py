@@ -29,8 +29,8 @@ from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import (
     Common,
-    Listener,
     Node,
+    ReceivingNode,
     check_filters,
     check_received,
     check_sizes,
@@ -41,8 +41,8 @@ from heliograph.simulation.node import (
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
-LOCAL = "own"  # a relay's one filter
-SENSORLESS = Listener({}, 0, (), True)  # a node that estimates from its neighbours alone
+LOCAL = "local"  # a relay's one filter
+SENSORLESS = ReceivingNode({}, 0, (), True)  # a node that estimates from its neighbours alone
 
 
 class Kind(NamedTuple):
@@ -75,7 +75,7 @@ class Network(Module):
     """
 
     plant: AnyPlant
-    nodes: dict[str, Node | Listener]
+    nodes: dict[str, Node | ReceivingNode]
     fused: dict[str, Fusion | AbstractFilter]
     meshes: dict[str, Fusion]
     relays: RelayNetwork | None
@@ -91,10 +91,10 @@ class Network(Module):
     def __init__(
         self,
         plant: AnyPlant,
-        nodes: Mapping[str, Node | Listener | None],
-        fused: Mapping[str, Fusion | AbstractFilter] | None = None,
-        relays: RelayNetwork | None = None,
-        common: Common | None = None,
+        nodes: "Mapping[str, Node | ReceivingNode | None]",
+        fused: "Mapping[str, Fusion | AbstractFilter] | None" = None,
+        relays: "RelayNetwork | None" = None,
+        common: "Common | None" = None,
     ):
         self.plant, self.relays, self.common, self.single = plant, relays, common, False
         self.nodes = {
@@ -111,9 +111,9 @@ class Network(Module):
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
             if node != SENSORLESS:
-                check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
-            for filter_, element in node.filters.items():
-                check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
+                check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
+            for label, element in node.filters.items():
+                check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -159,7 +159,7 @@ class Network(Module):
 
         At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
         draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
-        the relays, each with a single filter "own", and "receiver". A recording may leave out what a relay received.
+        the relays, each with a single filter "local", and "receiver". A recording may leave out what a relay received.
 
         Args:
             relays: the relays' slots and hops.
@@ -186,7 +186,7 @@ class Network(Module):
         outputs = tuple(first(relays.sensor).outputs)
         # All places receive sums of hops.
         nodes = {
-            name: Listener(filters[name], item, outputs, relays.always_receives(name))
+            name: ReceivingNode(filters[name], item, outputs, relays.always_receives(name))
             for name, item in zip(relays.filters, relays.received, strict=True)
         }
         return Network(relays.plant, nodes, relays=relays)
@@ -217,16 +217,18 @@ class Network(Module):
         check_forgets("channel of nodes that share it", first(channel))
         # Each output goes to one node.
         received = {
-            name: max((item.received for item in filter_.values()), default=0) for name, filter_ in filters.items()
+            name: max((item.received for item in by_name.values()), default=0) for name, by_name in filters.items()
         }
         if sum(received.values()) != first(channel).outputs:
             raise fail(
-                "nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", received
+                "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
             )
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
-        for name, filter_ in filters.items():
-            check_filters(filter_, received[name])
-        nodes = {name: Listener(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()}
+        for name, by_name in filters.items():
+            check_filters(by_name, received[name])
+        nodes = {
+            name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
+        }
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
     def rows(self) -> dict[str, np.ndarray]:
@@ -322,7 +324,7 @@ class Network(Module):
         # An informed rule: it needs the joint moments of the errors.
         known = self.parts_of(item.filter)
         if len(known) < len(local):
-            raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
+            raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
         if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
                        type(next(iter(known.values()))[2]).__name__)  # fmt: skip
@@ -343,14 +345,14 @@ class Network(Module):
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 
 
-def _world(node: Node | Listener) -> object:
+def _world(node: Node | ReceivingNode) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
         return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
 
 
-def claim_at(node: Node | Listener, item: AbstractFilter) -> Claim:
+def claim_at(node: Node | ReceivingNode, item: AbstractFilter) -> Claim:
     """Claim of a filter at a node."""
     return node.claim_of(item) if isinstance(node, Node) else item.claim
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_times, fail, instance, table
@@ -19,7 +20,7 @@ from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters
@@ -28,14 +29,17 @@ from heliograph.smoothing.modes import AbstractSmoothing
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
+Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
+
+
 def run(
-    network: Network,
-    measurements: Mapping[str, ArrayLike],
+    network: "Network",
+    measurements: "Mapping[str, ArrayLike]",
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     time: Float[ArrayLike, " steps"] | None = None,
-    smooth: AbstractSmoothing | None = None,
-    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
-) -> Record:
+    smooth: "AbstractSmoothing | None" = None,
+    reports: Reports | None = None,
+) -> "Record":
     """Run every filter of the network over recorded measurements.
 
     Values beyond a node's limits, and those that are implausible for all filters of a node
@@ -97,7 +101,7 @@ def run(
     return found_record(network, part, result, clock)
 
 
-def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Measurements without those beyond their node's limits, which are warned of."""
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z

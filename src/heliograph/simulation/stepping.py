@@ -32,7 +32,7 @@ from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh, meshes_of
 from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
 from heliograph.smoothing.backward_pass import planned_with_past
 
@@ -280,7 +280,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
         observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
-        raise fail("fusion", f"one of {observation}, which hear reports", repr(name))
+        raise fail("fusion", f"one of {observation}, which receive reports", repr(name))
     # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
     alone = Network(
@@ -306,7 +306,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     )
 
 
-def _with_only(node: Node | Listener, name: str) -> Node | Listener:
+def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
     filters = {single: item for single, item in node.filters.items() if single == name}
     if isinstance(node, Node):

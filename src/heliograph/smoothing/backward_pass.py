@@ -18,12 +18,12 @@ T = TypeVar("T")
 
 
 def smoother_steps(
-    filter: AbstractFilter,
+    filter: "AbstractFilter",
     measurements: Float[ArrayLike, "steps received"],
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     state: PyTree | None = None,
     first_step: int = 0,
-) -> tuple[PyTree, AbstractSmootherStep]:
+) -> "tuple[PyTree, AbstractSmootherStep]":
     """Step a filter over rows of data: its state after them, and its smoother steps stacked along time.
 
     Args:

@@ -87,7 +87,7 @@ WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
 def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
     """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
 
-    A variance that is told is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is told to 1e-3.
+    A claimed variance is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is claimed to 1e-3.
     """
     noise = [[1e-9, 0.0], [0.0, 1e-9]]
     lost = 0
@@ -186,7 +186,7 @@ def test_more_precise_outputs_than_are_unrolled():
 
 
 def test_a_noise_free_output_has_a_gradient():
-    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not heard too."""
+    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not received too."""
 
     def mean(wide):
         plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))

@@ -134,8 +134,8 @@ class _Check:
         try:
             await asyncio.wait_for(listen(), self.patience)
         except TimeoutError:
-            missing, count_ = len(set(bodies) - set(result)), len(bodies)
-            what = f"receive: expected {count_} messages within {self.patience:g} s, {missing} did not come"
+            missing, total = len(set(bodies) - set(result)), len(bodies)
+            what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
             raise AssertionError(what) from None
         return _once(result)
 
@@ -166,10 +166,10 @@ class _Check:
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
-    def _bodies(self, count_: int) -> list[bytes]:
+    def _bodies(self, total: int) -> list[bytes]:
         """Make bodies that were not sent before; the first is long."""
         return [
-            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(count_)
+            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)
         ]
 
 

@@ -22,7 +22,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.centre import Listening, listening
+from heliograph.simulation.centres.centre import ObservationModel, observation_model
 from heliograph.simulation.centres.edges import Edges, edges_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -91,7 +91,7 @@ class Mesh(Module):
     buckets: tuple[Rows, ...]
     ranks: np.ndarray
     edges: Edges
-    groups: tuple[Listening | None, ...]
+    groups: tuple[ObservationModel | None, ...]
     senders: np.ndarray
     order: np.ndarray
     counts: tuple[int, ...] = eqx.field(static=True)
@@ -324,11 +324,11 @@ def mesh_of(network: Network, name: str) -> Mesh:
     graph = graph_of(fusion.neighbours, nodes)
     # Models of the measurements, group after group.
     place = {node: i for i, node in enumerate(nodes)}
-    groups: list[Listening | None] = []
+    groups: list[ObservationModel | None] = []
     order: dict[str, int] = {}
     for names in network.groups:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        groups.append(listening([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
+        groups.append(observation_model([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
         order |= {node: len(order) + i for i, node in enumerate(names)}
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
     mine = [tuple(place[node] for node in network.groups[kind.group]) for kind in kinds]

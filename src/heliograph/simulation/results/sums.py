@@ -200,7 +200,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
     ) -> StatisticsByName:
         """Return the statistics with `smoothed`."""
         results = {
-            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
+            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.items()
         }
         result.smoothed = StatisticsByName(results, smoothed.states)
