@@ -37,11 +37,12 @@ class MomentsSmootherStep(AbstractSmootherStep):
         """Return the moments as they are."""
         return later
 
-    def ahead(self, point: Point) -> Point:
+    def ahead(self, point: Point, covariance: jax.Array) -> Point:
         """x_j + M (y - y-) and P_j - M (P- - P) M', M the product of all J since j."""
         gain = _product_of(point.link, self._gain())
         news = applied(gain, self.mean - self.prior_mean)
-        return Point(point.mean + news, less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+        after = less(point.covariance, gain, self.prior_covariance - self.covariance)
+        return point._replace(mean=point.mean + news, covariance=after, link=gain)
 
     def without_data(self) -> AbstractSmootherStep:
         """Return the step without both means."""
@@ -51,9 +52,6 @@ class MomentsSmootherStep(AbstractSmootherStep):
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
         """Return the step with these means."""
         return replace(self, mean=mean, prior_mean=prior_mean)
-
-    def _link(self, n: int) -> jax.Array:
-        return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
 
     def _gain(self) -> jax.Array:
         return _solved(self.prior_covariance, self.cross)
