@@ -281,7 +281,7 @@ def test_the_covariance_of_an_unstable_plant_held_by_its_inputs_stays(make):
 
 
 def test_behind_a_random_gain_far_from_zero_a_combination_that_says_nothing_is_left_out():
-    """Three outputs of two states are tied, and so is the noise of the random gain, of which 1e-6 is not along the mean.
+    """Three outputs of two states are tied and so is the noise of the random gain, of which 1e-6 is not along the mean.
 
     What the elimination leaves of the tied combination, 1e-11 of the outputs, is no measurement without noise.
     """
