@@ -7,19 +7,18 @@ from contextlib import suppress
 
 from cyclopts import CycloptsError
 
-from heliograph.cli.app import app
-from heliograph.cli.completion import completion
+from heliograph.cli.app import app, completion
 from heliograph.cli.design import design
-from heliograph.cli.explore import explore
 from heliograph.cli.export import export
 from heliograph.cli.fit import fit
+from heliograph.cli.inspect import inspect
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
 from heliograph.cli.stopping import INTERRUPTED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
-from heliograph.cli.sweep import sweep
+from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
@@ -27,7 +26,7 @@ BAD_INPUT = 2
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO  # files name themselves, what is printed does not
 
 # In the order of the help.
-COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
+COMMANDS = new, inspect, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
 for single in COMMANDS:
     app.command(single)
 

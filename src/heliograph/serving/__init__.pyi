@@ -14,24 +14,30 @@ from .message import (
     Message as Message,
     read_message as read_message,
 )
+from .brokers.opcua import (
+    Reporting as Reporting,
+    read_reporting as read_reporting,
+)
 from .output import (
     Estimates as Estimates,
     Output as Output,
     Refused as Refused,
     FilterOutput as FilterOutput,
 )
-from .storage.in_memory_store import (
+from .storage.store_protocol import (
     InMemoryStore as InMemoryStore,
+    identity as identity,
 )
 from .storage.store import (
     Store as Store,
 )
-from .storage.identity import (
-    identity as identity,
-)
 from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
+    connected as connected,
+    Part as Part,
+    part_of as part_of,
+    word as word,
 )
 from .brokers.pipe import (
     Pipe as Pipe,
@@ -39,14 +45,6 @@ from .brokers.pipe import (
 from .brokers.url import (
     Address as Address,
     address as address,
-)
-from .brokers.broker import (
-    connected as connected,
-)
-from .brokers.partition import (
-    Part as Part,
-    part_of as part_of,
-    word as word,
 )
 from .loop import (
     keep_running as keep_running,

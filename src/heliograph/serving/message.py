@@ -2,7 +2,7 @@
 
 from datetime import datetime
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapter, ValidationError, WithJsonSchema
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
@@ -56,6 +56,7 @@ class Message(BaseModel):
     arrival: Moment | None = Field(None, description="Time of arrival; at once if left out.")
 
 
+Payload: TypeAlias = bytes | Message | str  # a line of JSON; a message read already; why it could not be read
 _READER = TypeAdapter(Message)
 
 

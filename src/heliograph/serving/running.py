@@ -11,18 +11,16 @@ from pathlib import Path
 from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.brokers.broker import connected
-from heliograph.serving.brokers.partition import Part
 from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.transport import Part, connected
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.in_memory_store import InMemoryStore
-from heliograph.serving.storage.store_protocol import Damage, StoreProtocol
+from heliograph.serving.storage.store_protocol import Damage, InMemoryStore, StoreProtocol, identity
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing
@@ -43,6 +41,7 @@ class ServiceSettings:
         parts: number of parts of the plants that several processes share.
         page: port, or address and port, of the page.
         anew: names of plants that begin anew.
+        sources: sources of messages that others make, by topic; None reads messages in our own form alone.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -57,6 +56,7 @@ class ServiceSettings:
     parts: int | None = None
     page: str | None = None
     anew: tuple[str, ...] = ()
+    sources: object = None
 
     def __post_init__(self) -> None:
         if self.snapshot is not None:
@@ -70,6 +70,10 @@ class ServiceSettings:
             check_count("--parts", self.parts)
             if self.store is None or self.broker is None:
                 raise fail("--parts", "a store and a broker that all processes share", "not both")
+            if self.sources is not None:
+                raise fail(
+                    "--parts", "messages in our own form, which name their part", "sources in the network's file"
+                )
 
 
 def store_of(network: str, given: str | None, parts: int | None) -> str | None:
@@ -117,16 +121,21 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
+    # The store first, whose state the service goes on from.
     stop = asyncio.Event()
     fleet = Fleet(lanes, settings.options)
     store = _open_store(settings, fleet)
     resumed, service = store.count() > 0, Service(fleet, store, _say)
     try:
         with signals(stop):
-            transport = Pipe() if settings.broker is None else connected(settings.broker)
+            reads = None if settings.sources is None else Translator(settings.sources, settings.network)
+            broker = settings.broker
+            transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
             await serve_until(stop, look(service), transport)
     finally:
         store.close()
+    for left in [] if reads is None else reads.left_out():
+        _say(left)
     if resumed and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")

@@ -25,13 +25,24 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
+from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.flags import check_flags
-from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
+from heliograph.simulation.node import (
+    Common,
+    Listener,
+    Node,
+    check_filters,
+    check_received,
+    check_sizes,
+    check_type,
+    lowered_claim,
+)
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
 LOCAL = "own"  # a relay's one filter
+SENSORLESS = Listener({}, 0, (), True)  # a node that estimates from its neighbours alone
 
 
 class Kind(NamedTuple):
@@ -51,38 +62,47 @@ class Network(Module):
 
     Args:
         plant: the plant.
-        nodes: nodes by name.
+        nodes: nodes by name; None for a node without a sensor, which estimates from its neighbours.
         fused: fusions by name: a `Fusion` of the estimates of one of the nodes' filters, or a central filter that
             receives all measurements, joined in the order of the nodes. In results they stand under the node name
-            "fused". None by default.
+            "fused", and fusions between neighbours under each of their nodes. None by default.
         relays: network of relays, set by `Network.of_relays`.
         common: common sensor and channel, set by `Network.sharing`.
 
     Raises:
-        ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has.
+        ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has; between
+            neighbours a node that cannot know the plant's state from those upstream.
     """
 
     plant: AnyPlant
     nodes: dict[str, Node | Listener]
     fused: dict[str, Fusion | AbstractFilter]
+    meshes: dict[str, Fusion]
     relays: RelayNetwork | None
     common: Common | None
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
+    mesh_kinds: tuple[Kind, ...] = eqx.field(
+        static=True
+    )  # of fusions between neighbours, sorted as in compiled code, after the filters' kinds
     single: bool = eqx.field(static=True)
 
     def __init__(
         self,
         plant: AnyPlant,
-        nodes: Mapping[str, Node | Listener],
+        nodes: Mapping[str, Node | Listener | None],
         fused: Mapping[str, Fusion | AbstractFilter] | None = None,
         relays: RelayNetwork | None = None,
         common: Common | None = None,
     ):
         self.plant, self.relays, self.common, self.single = plant, relays, common, False
-        self.nodes = table("nodes", nodes, "nodes")
-        self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
+        self.nodes = {
+            name: SENSORLESS if node is None else node for name, node in table("nodes", nodes, "nodes").items()
+        }
+        fusions = {} if fused is None else table("fused", fused, "fusions and central filters")
+        self.meshes = {name: item for name, item in fusions.items() if isinstance(item, Fusion) and item.neighbours}
+        self.fused = {name: item for name, item in fusions.items() if name not in self.meshes}
         self.names = tuple(self.nodes)
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
@@ -90,7 +110,8 @@ class Network(Module):
         # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
+            if node != SENSORLESS:
+                check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
             for filter_, element in node.filters.items():
                 check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
@@ -98,11 +119,15 @@ class Network(Module):
         if self.fused and FUSED in self.nodes:
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
         # Groups of nodes and kinds of filters, by structure.
-        self.groups = _grouped((name, (_world(n), n.filters)) for name, n in self.nodes.items())
+        meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
+        self.groups = _grouped((name, (_world(n), n.filters, meshes[name])) for name, n in self.nodes.items())
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)
             for alike in _grouped(self.nodes[names[0]].filters.items())
+        )
+        self.mesh_kinds = tuple(
+            Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
         # Sensors and channels of each group fit, then fusions.
         for names in self.groups:
@@ -111,6 +136,8 @@ class Network(Module):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
                 received_angles(plant, node.sensor, node.channel)
         self._check_fused()
+        for name, mesh in self.meshes.items():
+            check_mesh(name, mesh, self)
 
     def _check_fused(self) -> None:
         for name, item in self.fused.items():
@@ -244,6 +271,11 @@ class Network(Module):
             for i, node in enumerate(self.groups[kind.group])
         }
 
+    def mesh_nodes(self, name: str) -> tuple[str, ...]:
+        """Names of the nodes of a fusion between neighbours, in the order of the network."""
+        neighbours = self.meshes[name].neighbours or {}
+        return tuple(node for node in self.names if node in neighbours)
+
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the plant's states."""
@@ -258,9 +290,17 @@ class Network(Module):
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
-        claims = {name: {f: item.claim for f, item in node.filters.items()} for name, node in self.nodes.items()}
+        claims = {
+            name: {f: claim_at(node, item) for f, item in node.filters.items()} for name, node in self.nodes.items()
+        }
+        for name, mesh in self.meshes.items():
+            claim = mesh_claim(name, mesh, self)
+            for node in self.mesh_nodes(name):
+                claims[node][name] = claim
         if self.fused:
             claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
+            if any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values()):
+                claims[FUSED] = lowered(claims)[FUSED]
         return lowered(claims) if self.single else claims
 
     def in_single_precision(self) -> "Network":
@@ -275,7 +315,7 @@ class Network(Module):
         names = self.nodes_with(item.filter)
         # A rule that needs nothing but the estimates.
         if not isinstance(item.rule, AbstractInformedFusion):
-            return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
+            return item.claim([claim_at(self.nodes[n], self.nodes[n].filters[item.filter]) for n in names])
         rule, local = type(item.rule).__name__, {n: self.nodes[n] for n in names}
         if item.quantizer is not None and not item.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
@@ -306,16 +346,18 @@ class Network(Module):
 def _world(node: Node | Listener) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
-        return node.sensor, anonymous(node.channel), node.informed_by
+        return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
+
+
+def claim_at(node: Node | Listener, item: AbstractFilter) -> Claim:
+    """Claim of a filter at a node."""
+    return node.claim_of(item) if isinstance(node, Node) else item.claim
 
 
 def lowered(claims: Claims) -> Claims:
     """Lower every claim to "nominal" at most."""
-    return {
-        node: {name: "none" if claim == "none" else "nominal" for name, claim in element.items()}
-        for node, element in claims.items()
-    }
+    return {node: {name: lowered_claim(claim) for name, claim in element.items()} for node, element in claims.items()}
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:

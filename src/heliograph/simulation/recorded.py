@@ -16,6 +16,7 @@ from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
@@ -24,7 +25,7 @@ from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoo
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
-Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
+Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
 def run(
@@ -39,6 +40,7 @@ def run(
 
     Values beyond a node's limits, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
+    A value that the rule of its sender forbids is warned of and used.
 
     Args:
         network: the network.
@@ -48,8 +50,9 @@ def run(
         time: (steps,), stored in the record; 0, 1, ... by default.
         smooth: smoothing as in `monte_carlo`; None by default.
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
-            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be
-            left out where the uplinks are deterministic.
+            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
+            fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
+            message did not arrive. They may be left out where the links are deterministic.
 
     Returns:
         The record, without truth.
@@ -72,14 +75,23 @@ def run(
     # Values beyond a node's limits did not arrive.
     for name in network.names:
         z[name] = _within(name, network.nodes[name], z[name])
+        # Values that the rule of a sender forbids.
+        if rows := forbidden_rows(network.nodes[name], z[name]):
+            warnings.warn(
+                f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+                "within delta of the value before, and no heartbeat due",
+                stacklevel=2,
+            )
     # Filters, and what became of the reports.
     part = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
         given = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = {
+        arrivals: dict[str, PyTree] = {
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
+        } | {
+            name: mesh.edges.recorded(name, mesh.nodes, given.get(name), steps) for name, mesh in filters.meshes.items()
         }
         result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
     return found_record(network, part, result, clock)
@@ -128,6 +140,9 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 def _filtered(*arguments: PyTree) -> PyTree:
     """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
+    filters = arguments[0]
+    if filters.meshes:  # nodes by the hundred are no straight-line code
+        return to_numpy(_by_xla(*arguments))
     choice = chosen(_run_filters, arguments, [False] * len(arguments))
     if choice.code is None:
         return to_numpy(_by_xla(*arguments))

@@ -121,7 +121,7 @@ def monte_carlo(
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if not single and one_processor():
+    if not single and not network.meshes and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
         made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
         if made is not None:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.centre import Centre, centre_of, without_mean
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
@@ -38,7 +38,7 @@ class Centred(NamedTuple):
     mean: Float[Array, " n"]
 
 
-class PolynomialFilter(AbstractFilter):
+class PolynomialFilter(AbstractSizedFilter):
     """Filter of all monomials of z up to `degree`; a missing component makes each of its monomials missing.
 
     The innovation is that of z itself, among its monomials, with its exact covariance; the log-likelihood is Gaussian
@@ -58,10 +58,6 @@ class PolynomialFilter(AbstractFilter):
     centre: Centre | None
     degree: int = eqx.field(static=True)
     endless: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
         instance("inner filter", inner, AbstractFilter, "a filter")
@@ -242,7 +238,7 @@ class MemoryState(NamedTuple):
     mean: Float[Array, " n"]
 
 
-class MemoryFilter(AbstractFilter):
+class MemoryFilter(AbstractSizedFilter):
     """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
 
     With saved gains, for complete data; see `ScheduledFilter` for the effect of gaps, `PolynomialFilter` for the
@@ -252,10 +248,6 @@ class MemoryFilter(AbstractFilter):
     linear: ScheduledFilter
     products: ScheduledFilter
     centre: Centre | None
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: Centre | None = None):
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre

@@ -1,15 +1,13 @@
-"""Shares of one with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
+"""Probabilities with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, logit
-from scipy.stats import norm
 
-from heliograph.numerics.readable import readable
+from heliograph.numerics.shares import Share as Share
 
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
 FALL_AT_END = 1.352772  # where the maximum lies at 0 or 1 only one side is left: half its 90 % point
@@ -18,31 +16,8 @@ END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
 
 
-@readable
-class Share(NamedTuple):
-    """A probability, estimated, and the ends of its 95 % interval."""
-
-    estimate: float
-    low: float
-    high: float
-
-
-def wilson(hits: float, of: float) -> Share:
-    """k / n, with the shares p that |k - n p| <= 1.96 sqrt(n p (1 - p)) allows; (NaN, 0, 1) of nothing.
-
-    Source: Wilson, Probable inference (1927).
-    """
-    if not of:
-        return Share(float("nan"), 0.0, 1.0)
-    z = float(norm.ppf(0.975))
-    p = hits / of
-    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
-    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
-    return Share(p, 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half))
-
-
 def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
-    """The best of the maxima found from the starts (logits), and the value there; logits stay within END.
+    """Maximise from several starts (logits); return the best point and the value there. Logits stay within END.
 
     precision: the relative change of the value at which a search ends.
     """
@@ -78,7 +53,7 @@ def _profile(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
 
 
 def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
-    """Where the profile of logit i crosses the level on one side; 0 or 1 where it does not."""
+    """Crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
@@ -94,6 +69,7 @@ def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> f
             near[others] = free
         return best - level
 
+    # a bracket by doubled steps from the top, then Brent's method
     inside, step = float(top[i]), 0.25
     if above(inside) <= 0:
         return float(expit(inside))
@@ -105,5 +81,5 @@ def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> f
 
 
 def logits(*shares: float) -> np.ndarray:
-    """Of shares inside (0, 1)."""
+    """Logits of shares inside (0, 1)."""
     return np.asarray(logit(np.array(shares)))

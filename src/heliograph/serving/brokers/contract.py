@@ -156,7 +156,9 @@ class _Check:
         assert batch.payloads, "receive: expected to wait for messages, got a batch of none"
         if acknowledge:
             await self._soon("acknowledge", batch.acknowledge())
-        return list(batch.payloads)
+        bodies = [body for body in batch.payloads if isinstance(body, bytes)]
+        assert len(bodies) == len(batch.payloads), "receive: expected the bytes that were sent"
+        return bodies
 
     async def _soon(self, what: str, waiting: Awaitable[T]) -> T:
         try:

@@ -16,6 +16,9 @@ def reports_by_name(
     """Reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
     result: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
+        if name in network.meshes:
+            result[name] = _arrivals(network, name, np.asarray(values))
+            continue
         fusion = network.fused[name]
         assert isinstance(fusion, Fusion)  # no other rule uses reports
         nodes, n = network.nodes_with(fusion.filter), len(network.states)
@@ -24,6 +27,18 @@ def reports_by_name(
             node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
             for i, node in enumerate(nodes)
         }
+    return result
+
+
+def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
+    """Messages that arrived from each node's neighbours, 1 or NaN (..., rounds times neighbours), and no delays."""
+    neighbours = network.meshes[name].neighbours or {}
+    result = {}
+    for i, node in enumerate(network.mesh_nodes(name)):
+        if count := len(neighbours[node]):
+            flags = arrived[..., i, :, 1 : count + 1]
+            values = np.where(flags, 1.0, np.nan).reshape(*flags.shape[:-2], -1)
+            result[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return result
 
 
@@ -37,6 +52,15 @@ def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str,
     return {name: received[name] for name in network.names}
 
 
+def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    return {
+        name: np.asarray(node_group)[..., i, :]
+        for group, node_group in groups.items()
+        for i, name in enumerate(network.groups[int(group)])
+    }
+
+
 def by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
@@ -45,7 +69,7 @@ def by_name(
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """
     result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
-    for (group, filters), part in zip(network.kinds, batch["estimates"], strict=True):
+    for (group, filters), part in zip(network.kinds + network.mesh_kinds, batch["estimates"], strict=True):
         values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
         for name, rows in zip(filters, values, strict=True):
             for node, row in zip(network.groups[group], rows, strict=True):
