@@ -30,10 +30,10 @@ NETWORK = hg.Network(PLANT, {"a": NODE})
 
 CALLS = [  # what is called, and arguments with which it works
     (hg.Discrete, {"values": [1.0, 2.0], "probabilities_": [0.5, 0.5], "radius": 0.0}),
-    (hg.LogNormal, {"log_mean": 0.0, "log_deviation": 1.0}),
-    (hg.Nakagami, {"shape": 1.0, "power": 1.0}),
+    (hg.random_affine.LogNormal, {"log_mean": 0.0, "log_deviation": 1.0}),
+    (hg.random_affine.Nakagami, {"shape": 1.0, "power": 1.0}),
     (hg.Rayleigh, {"scale": 1.0}),
-    (hg.Rician, {"sight": 1.0, "scale": 1.0}),
+    (hg.random_affine.Rician, {"sight": 1.0, "scale": 1.0}),
     (hg.Gaussian, {"covariance_": EYE, "mean": [0.0, 0.0]}),
     (hg.LinearPlant, {"matrix": EYE, "noise": 0.1, **PRIOR, "input_matrix": [[1.0], [0.0]], "states": ["a", "b"],
                      "inputs": ["u"]}),
@@ -46,7 +46,7 @@ CALLS = [  # what is called, and arguments with which it works
     (hg.hop, {"gain": 1.0, "noise": 0.1, "power": 1.0, "amplification": 1.0, "dimension": 1}),
     (hg.parallel, {"channels": [HOP, HOP]}),
     (hg.perfect, {"dimension": 1}),
-    (hg.with_direct_link, {"relayed": HOP, "direct": HOP}),
+    (hg.model.with_direct_link, {"relayed": HOP, "direct": HOP}),
     (hg.model.over_time, {"items": [HOP, HOP]}),
     (hg.cubature_filter, {**LINK, "update": filters.Polytope(), **PRIOR}),
     (hg.extended_filter, LINK),

@@ -52,7 +52,7 @@ WRONG = {
     "late for now": (with_flag(LINK, late=True), mode_known_filter(PLANT, SENSOR, LINK), THIS, "the step before"),
     "now for late": (with_flag(LINK), mode_late_filter(PLANT, SENSOR, LINK), BEFORE, "one of this step"),
     "a class": (with_flag(LINK, EYE), mode_known_filter(PLANT, SENSOR, LINK), THIS, "Modes, no mode"),
-    "a number": (hg.with_direct_link(HOP, HOP), mode_late_filter(PLANT, SENSOR, LINK), BEFORE, "GainAndNoise, no mode"),
+    "a number": (hg.model.with_direct_link(HOP, HOP), mode_late_filter(PLANT, SENSOR, LINK), BEFORE, "GainAndNoise, no mode"),
     "late class": (with_flag(LINK, EYE, late=True), side_information_filter(PLANT, SENSOR, LINK, EYE),
                    r"hg\.model\.with_flag\(link, flags\)", "the step before"),
     "inside": (with_flag(LINK), hg.filters.late_filter(mode_late_filter(PLANT, SENSOR, LINK), 2), BEFORE, "this step"),

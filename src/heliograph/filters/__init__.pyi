@@ -58,6 +58,9 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
+from .rows import (
+    Filtered as Filtered,
+)
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
@@ -73,6 +76,10 @@ from .gaussian.transform import (
     Cubature as Cubature,
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
+    Transformed as Transformed,
+)
+from .gaussian.unscented import (
+    Unscented as Unscented,
 )
 from .gaussian.update import (
     AbstractUpdate as AbstractUpdate,

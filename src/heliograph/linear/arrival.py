@@ -92,28 +92,32 @@ def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tu
     return high, result
 
 
-def plant_matrices(plant: AnyPlant) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """A and Cov(w) of a constant linear plant.
+def plant_matrices(
+    plant: AnyPlant, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+    """A and Cov(w) of a constant linear plant, for `what` needs them.
 
     Raises:
         ValueError: another plant.
     """
     if isinstance(plant, OverTime) or not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise):
-        raise fail("boundedness", "a LinearPlant that does not vary", _kind(plant))
-    refuse_angles("boundedness", plant)
+        raise fail(what, "a LinearPlant that does not vary", _kind(plant))
+    refuse_angles(what, plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
 
 
-def sensor_matrices(sensor: AnySensor, states: int) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """C and Cov(v) of a constant linear sensor of so many states.
+def sensor_matrices(
+    sensor: AnySensor, states: int, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
+    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them.
 
     Raises:
         ValueError: another sensor.
     """
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
-        raise fail("boundedness", "a LinearSensor that does not vary", _kind(sensor))
+        raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
     check_sensor(sensor, states)
-    refuse_angles("boundedness", sensor)
+    refuse_angles(what, sensor)
     return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
 
 

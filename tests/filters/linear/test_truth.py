@@ -10,7 +10,7 @@ from tests.filters.modal_problems import BURSTS, GOOD, PLANT, RELAY, SENSOR, bur
 true_error, without_memory, memory_matters = hg.filters.true_error, hg.model.without_memory, hg.model.memory_matters
 Modes = hg.random_affine.Modes
 CONVERGED = 200  # steps, after which nothing of what is looked at changes
-HOPS = [hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))]
+HOPS = [hg.model.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))]
 
 
 def memoryless(plant, sensor, channel):
@@ -58,7 +58,9 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", [bursts(), hg.amplify_and_forward(HOPS), hg.with_direct_link(bursts(), HOPS[0])])
+@pytest.mark.parametrize(
+    "channel", [bursts(), hg.amplify_and_forward(HOPS), hg.model.with_direct_link(bursts(), HOPS[0])]
+)
 def test_the_exact_filter_claims_its_truth(channel):
     result = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 60)
     np.testing.assert_allclose(result.claimed, result.true, rtol=1e-12)

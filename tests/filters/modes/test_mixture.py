@@ -156,7 +156,7 @@ def test_with_gaussian_noise_it_is_gpb1():
 
 def test_a_drift_has_no_atoms():
     with pytest.raises(ValueError, match="gains of finitely many values, got one that drifts"):
-        hg.mixture_filter(PLANT, SENSOR, hg.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
+        hg.mixture_filter(PLANT, SENSOR, hg.model.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
 
 
 @pytest.mark.parametrize("channel", [hg.dropout(hg.perfect(), 0.0), hg.model.silent(noise=0), hg.hop(0.0, 0.0)])
