@@ -33,7 +33,7 @@ from .over_time import (
 from .past import (
     with_past as with_past,
 )
-from .plant import (
+from .bias import (
     with_bias as with_bias,
 )
 from .relays import (

@@ -71,9 +71,17 @@ class GaussianFilter(AbstractBeliefFilter):
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
             return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
         observed_of = observed_through(channel.mean_gain, sensor.matrix)
-        process = plant.noise_covariance(jnp.asarray(u))
+        u = jnp.asarray(u)
+        process = plant.noise_covariance(u)
         result = linear_smoother_step(
-            after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
+            after,
+            prior,
+            plant.transition_matrix(u),
+            process,
+            observed_of,
+            innovation.value,
+            innovation.covariance,
+            self.claim,
         )
         return replace(result, angles=plant.angles)
 
