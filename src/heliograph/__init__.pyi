@@ -45,6 +45,7 @@ from .model.channel import (
 from .model.fading import (
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
+    shared as shared,
 )
 from .filters.gaussian.gaussian import (
     cubature_filter as cubature_filter,

@@ -66,7 +66,7 @@ def test_a_filter_is_that_of_the_plant_step_by_step(name, plant, pushed):
         assert varying.claim == "exact"
         planned = varying.planned(DT).run(np.nan_to_num(Z), DT)
         np.testing.assert_allclose(planned.covariances, varying.run(np.nan_to_num(Z), DT).covariances, rtol=1e-12)
-    if name != "factored":
+    if name != "factored" and not pushed:  # the data are not such as a pushed plant gives: smoothing would warn
         smoothed = hg.rts_smoother(varying, Z, DT), hg.rts_smoother(given, Z, np.ones((STEPS, 1)))
         np.testing.assert_allclose(smoothed[0].means, smoothed[1].means, atol=1e-11)
 
@@ -94,12 +94,12 @@ def test_what_is_claimed_is_the_error():
 
 def test_the_true_error_is_the_claim():
     truth = hg.filters.true_error(hg.linear_filter(PLANT, SENSOR, LINK), PLANT, SENSOR, LINK, STEPS, DT)
-    np.testing.assert_allclose(truth.actual, truth.claimed, rtol=1e-10)
+    np.testing.assert_allclose(truth.true, truth.claimed, rtol=1e-10)
 
 
 def test_units_do_not_matter():
     node = hg.Node(SENSOR, hg.perfect(), {"f": hg.kalman_filter(PUSHED, SENSOR)})
-    hg.testing.check_scaling(hg.Network(PUSHED, {"a": node}))
+    hg.testing.check_scaling(hg.Network(PUSHED, {"a": node}), inputs=DT[:5])
 
 
 @pytest.mark.parametrize(
@@ -109,9 +109,7 @@ def test_units_do_not_matter():
         lambda: hg.linear.critical_arrival(PLANT, SENSOR),
         lambda: hg.linear.gain_over_linear(PLANT, SENSOR, LINK, 5),
         lambda: hg.polynomial_filter(PLANT, SENSOR, LINK, 2, 5),
-        lambda: hg.linear_filter(
-            PLANT, SENSOR, hg.model.delayed(hg.random_affine.Mixture([LINK, LINK], [0.5, 0.5]), 1)
-        ),
+        lambda: hg.linear_filter(PLANT, SENSOR, hg.model.delayed(LINK, hg.Discrete([0, 1], [0.5, 0.5]))),
         lambda: hg.simulation.certify_boundedness(hg.Network(PLANT, {"a": hg.Node(SENSOR, LINK, {})})),
         lambda: hg.design(hg.Network(PLANT, {"a": hg.Node(SENSOR, LINK, {})}), budget=1.0),
         lambda: hg.power(hg.Network(PLANT, {"a": hg.Node(SENSOR, LINK, {})})),
@@ -121,7 +119,6 @@ def test_what_is_computed_before_data_refuses_in_one_line(planned):
     with pytest.raises(ValueError) as caught:
         planned()
     assert "\n" not in str(caught.value) and "expected" in str(caught.value), caught.value
-    print(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ def link(transition=BURSTS, name=None):
 
 
 RUNS, HORIZON = 64, 30
-CHAIN = hg.random_affine.MarkovChain(BURSTS)
+CHAIN = hg.random_affine.MarkovChain(BURSTS, name="valley")
 
 
 def gains(channels):

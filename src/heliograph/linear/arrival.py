@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
+from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
@@ -100,7 +101,8 @@ def plant_matrices(
     Raises:
         ValueError: another plant.
     """
-    if isinstance(plant, OverTime) or not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise):
+    constant = isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
+    if not constant or isinstance(plant.matrix, OfInputs):
         raise fail(what, "a LinearPlant that does not vary", _kind(plant))
     refuse_angles(what, plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
@@ -122,4 +124,6 @@ def sensor_matrices(
 
 
 def _kind(item: AnyPlant | AnySensor) -> str:
-    return "one that varies" if isinstance(item, OverTime) else type(item).__name__
+    if isinstance(item, OverTime):
+        return "one that varies"
+    return f"one that varies with {list(item.inputs)}" if isinstance(item, LinearPlant) else type(item).__name__

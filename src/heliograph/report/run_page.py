@@ -189,7 +189,7 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     return [Text([text]), Table(["filter", "claim", "size", "correlation", "p"], rows, caption), *picture]
 
 
-def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture]:
+def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     rows = []
     for link in health.links:
         mean, deviation = (f"{link.values.mean():.4g}", f"{link.values.std():.4g}") if len(link.values) else ("–", "–")
@@ -199,7 +199,16 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
     caption = "When each component arrived (blue, above) and when it did not (red, below)."
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    return [Table(headers, rows), *picture]
+    return [Table(headers, rows), *picture, *shared_text(health.shared)]
+
+
+def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+    """Return what nodes share as a sentence each; nothing where their links are independent."""
+    said = [
+        f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
+        for name, nodes in shared.items()
+    ]
+    return [Text(said)] if said else []
 
 
 def run_summary(health: Health) -> dict[str, Json]:
@@ -218,4 +227,10 @@ def run_summary(health: Health) -> dict[str, Json]:
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}
-    return {"rows": len(health.record.time), "warnings": health.warnings(), "filters": filters, "links": links}
+    return {
+        "rows": len(health.record.time),
+        "warnings": health.warnings(),
+        "filters": filters,
+        "links": links,
+        "shared": {name: list(nodes) for name, nodes in health.shared.items()},
+    }

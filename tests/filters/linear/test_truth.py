@@ -34,8 +34,7 @@ def test_two_hops_that_drift():
 
 def test_a_filter_for_two_shadows_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
-    chain = hg.random_affine.MarkovChain(BURSTS)
-    apart, together = (hg.parallel([bursts(c) for c in (a, b)]) for a, b in ((BURSTS, BURSTS), (chain, chain)))
+    apart, together = (hg.parallel([link] * 2) for link in (bursts(), hg.shared(bursts(), "road")))
     result = true_error(hg.linear_filter(PLANT, two, apart), PLANT, two, together, CONVERGED)
     assert result.claimed[-1, 0, 0] == pytest.approx(0.148447, abs=6e-7)
     assert result.true[-1, 0, 0] == pytest.approx(0.238690, abs=6e-7)
