@@ -34,8 +34,10 @@ R = TypeVar("R")
 class AbstractFilter(Module):
     """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
 
-    Deterministic: it never receives a random key. A component of z that is NaN did not arrive and is skipped. The
-    state is a pytree of arrays, so one filter object serves a stream, a recording and thousands of runs at once.
+    Deterministic: the same state and data give the same result. It receives no random key; a filter that draws holds
+    one in its state, into which it folds the data (`docs/extend.md` has one). A component of z that is NaN did not
+    arrive and is skipped. The state is a pytree of arrays, so one filter object serves a stream, a recording and
+    thousands of runs at once.
     To write one: give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and
     `estimate` under `@in_float64` where they compute anything. Data of other sizes than these fields state are refused.
 

@@ -42,8 +42,8 @@ class AbstractMemory(Module):
     """Memory of a link: a state that moves from step to step, on which the law of gain and noise depends.
 
     Links share a memory by its `name`, which also seeds its draws (shared fading, `hg.shared`). One without a name is
-    of one link: where an object stands at several nodes or hops, each has its own. Within one map the maps that refer to
-    one object are in one state.
+    of one link: where an object stands at several nodes or hops, each has its own. Within one map the maps that refer
+    to one object are in one state.
     """
 
     name: eqx.AbstractVar[str | None]

@@ -224,6 +224,7 @@ def run_summary(health: Health) -> dict[str, Json]:
                 "p_value": filter_.test.p_value,
             }
         filters.setdefault(filter_.node, {})[filter_.filter] = results
+    # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}

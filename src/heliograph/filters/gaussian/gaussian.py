@@ -70,9 +70,9 @@ class GaussianFilter(AbstractBeliefFilter):
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
             return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
-        observed_of = observed_through(channel.mean_gain, sensor.matrix)
+        # F, Q and M H of the step.
         u = jnp.asarray(u)
-        process = plant.noise_covariance(u)
+        observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
         result = linear_smoother_step(
             after,
             prior,
