@@ -101,8 +101,11 @@ def plant_matrices(
     Raises:
         ValueError: another plant.
     """
-    constant = isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
-    if not constant or isinstance(plant.matrix, OfInputs):
+    if (
+        not isinstance(plant, LinearPlant)
+        or not isinstance(plant.noise, AbstractNoise)
+        or isinstance(plant.matrix, OfInputs)
+    ):
         raise fail(what, "a LinearPlant that does not vary", _kind(plant))
     refuse_angles(what, plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)

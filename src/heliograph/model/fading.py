@@ -78,8 +78,8 @@ def autoregressive_fading(
 ) -> Faded:
     """A link z = g y + n whose gain drifts: Gaussian, stationary, with `correlation` from one step to the next.
 
-    `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together, each
-    with its own mean and deviation.
+    `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together,
+    each with its own mean and deviation.
 
     Raises:
         ValueError: a negative deviation, a correlation outside [-1, 1], a noise that is no covariance.

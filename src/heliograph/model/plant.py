@@ -159,8 +159,8 @@ class LinearPlant(AbstractPlant):
             or that a full turn changes, functions of inputs without names.
     """
 
-    matrix: Square | OfInputs
-    input_matrix: Matrix | OfInputs
+    matrix: Square  # or OfInputs, which refuses to be taken for an array
+    input_matrix: Matrix  # likewise
     noise: AbstractNoise | NoiseFunction
     initial_mean: Vector
     initial_covariance: Square
@@ -187,7 +187,7 @@ class LinearPlant(AbstractPlant):
         if varies and not inputs:
             raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
         count = None if inputs is None or not varies else len(items("input names", inputs, "names"))
-        entry = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
+        entry: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
         if not callable(entry):
             entry = array("input matrix", entry, (n, count))
         self.inputs = names("input names", inputs, entry.shape[-1] if count is None else count, "u")
@@ -202,7 +202,7 @@ class LinearPlant(AbstractPlant):
         check_turns("plant", lambda x: self.transition_matrix(jnp.asarray(u)) @ x, self.initial_mean, self.angles,
                     self.angles)  # fmt: skip
 
-    def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Matrix | OfInputs:
+    def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Any:
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -113,7 +114,7 @@ def _squared(
 
 @compiled
 def _distance(a: Array, x: Array, size: Array) -> Array:
-    return squared_distance(a, x, size)
+    return squared_distance(jnp.asarray(a), jnp.asarray(x), size)
 
 
 def consistency(
