@@ -55,7 +55,7 @@ CALLS = [  # what is called, and arguments with which it works
     (hg.linear_filter, LINK),
     (hg.filters.open_loop_filter, {"plant": PLANT, **PRIOR}),
     (hg.polynomial_filter, {**SINGLE, "horizon": 3, "degree": 1}),
-    (hg.mixture_filter, {"plant": COINS[0], "sensor": COINS[1], "channel": hg.perfect(), "resolution": 0.0}),
+    (hg.filters.mixture_filter, {"plant": COINS[0], "sensor": COINS[1], "channel": hg.perfect(), "resolution": 0.0}),
     (hg.Fusion, {"filter": "f", "rule": hg.fusion.EqualIntersection(), "quantizer": ESCAPE}),
     (hg.Network, {"plant": PLANT, "nodes": {"a": NODE}, "fused": {"c": hg.Fusion("f", hg.fusion.EqualIntersection())}}),
     (hg.Network.of_relays, {"relays": RELAYS, "schedules": {}, "receivers": {}}),

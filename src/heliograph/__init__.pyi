@@ -23,6 +23,10 @@ from .random_affine.law import (
 from .random_affine.noise import (
     Gaussian as Gaussian,
 )
+from .random_affine.outliers import (
+    Contaminated as Contaminated,
+    StudentT as StudentT,
+)
 from .model.plant import (
     LinearPlant as LinearPlant,
     Plant as Plant,
@@ -47,6 +51,15 @@ from .model.fading import (
     markov_fading as markov_fading,
     shared as shared,
 )
+from .model.trigger import (
+    Periodic as Periodic,
+    SendOnDelta as SendOnDelta,
+    SendOnPredictionError as SendOnPredictionError,
+    StochasticTrigger as StochasticTrigger,
+)
+from .filters.event.factory import (
+    event_filter as event_filter,
+)
 from .filters.gaussian.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
@@ -64,8 +77,11 @@ from .filters.linear.linear import (
 from .filters.linear.polynomial import (
     polynomial_filter as polynomial_filter,
 )
-from .filters.modes.mixture import (
-    mixture_filter as mixture_filter,
+from .filters.gaussian.adaptive import (
+    adaptive_filter as adaptive_filter,
+)
+from .filters.gaussian.robust import (
+    robust_filter as robust_filter,
 )
 from .linear.steady_state import (
     steady_state as steady_state,

@@ -127,6 +127,7 @@ def test_lists_do_not_load_jax():
         *(
             "delays",
             "demo",
+            "event-triggered",
             "fusion",
             "late-data",
             "learning",

@@ -47,7 +47,7 @@ FILTERS = {
     "kalman": hg.kalman_filter,
     "linear": lambda plant, sensor: hg.linear_filter(plant, sensor, LINK),
     "memory": lambda plant, sensor: hg.linear_filter(plant, sensor, BURSTS),
-    "mixture": lambda plant, sensor: hg.mixture_filter(plant, sensor, LINK),
+    "mixture": lambda plant, sensor: hg.filters.mixture_filter(plant, sensor, LINK),
     "cubature": lambda plant, sensor: hg.cubature_filter(plant, sensor, LINK),
     "factored": lambda plant, sensor: hg.filters.imm_filter(plant, sensor, BURSTS),
 }

@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .gaussian.adaptive import (
+    AdaptiveFilter as AdaptiveFilter,
+)
 from .base import (
     AbstractFilter as AbstractFilter,
     corrects as corrects,
@@ -38,6 +41,9 @@ from .linear.linear import (
 from .linear.open_loop import (
     open_loop_filter as open_loop_filter,
 )
+from .modes.mixture import (
+    mixture_filter as mixture_filter,
+)
 from .modes.multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,
@@ -60,6 +66,9 @@ from .modes.mode_observed import (
 )
 from .rows import (
     Filtered as Filtered,
+)
+from .gaussian.robust import (
+    RobustFilter as RobustFilter,
 )
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,
@@ -90,4 +99,11 @@ from .gaussian.update import (
 from .linear.truth import (
     TrueError as TrueError,
     true_error as true_error,
+)
+from .weights import (
+    Gate as Gate,
+    Huber as Huber,
+    InverseMultiquadric as InverseMultiquadric,
+    StudentVB as StudentVB,
+    WoLF as WoLF,
 )

@@ -162,6 +162,11 @@ class AbstractFilter(Module):
         return False
 
     @property
+    def silence_tells(self) -> bool:
+        """True if a step at which nothing arrives changes the state and has a likelihood: then none is missing."""
+        return False
+
+    @property
     def horizon(self) -> int | None:
         """Number of steps that it covers; None if there is no last one."""
         return steps_covered(self)

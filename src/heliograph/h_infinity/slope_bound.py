@@ -16,7 +16,7 @@ NORM_ROUNDING = 1e-13  # relative, of the spectral norm of a small matrix
 
 
 class SlopeBound(NamedTuple):
-    """The largest norm that a Jacobian in the box can have, infinite if nothing is proven; why, if so."""
+    """Largest norm that a Jacobian in the box can have, infinite if nothing is proven, and the reason if so."""
 
     value: float
     reason: str
@@ -25,7 +25,7 @@ class SlopeBound(NamedTuple):
 def slope_bound(
     function: Callable[[jax.Array], jax.Array], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> SlopeBound:
-    """A proven bound of |f(x) - f(y)| / |x - y| over the box, sharpened until it is below `goal` or LIMIT is reached.
+    """Compute a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
 
     |J| <= |C| + |R| (spectral norms) for every J in the interval C +- R of a part's Jacobians; a function that is
     continuous, and differentiable but for kinks, has no larger ratio than the largest of these. Continuous is one made

@@ -61,3 +61,6 @@ from .solution import (
 from .tell_apart import (
     samples_to_tell as samples_to_tell,
 )
+from .senders import (
+    SenderFit as SenderFit,
+)

@@ -1,4 +1,4 @@
-"""Which of two laws a recording speaks for: a test of the mean difference of their log-likelihoods."""
+"""Comparison of two laws by a recording: a test of the mean difference of their log-likelihoods."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,13 @@ from heliograph.numerics.types import Float
 
 @readable
 class Comparison(NamedTuple):
-    """How much more likely one law finds a recording than another does.
+    """Test of whether a recording speaks for the first of two laws or for the second.
 
-    difference: mean per step of log p_a - log p_b, nats, with its standard error, which allows for correlation over
-    time; z their ratio, p_value two-sided.
+    Args:
+        difference: mean of log p_a - log p_b per step, in nats.
+        standard_error: its standard error, which allows for correlation over time.
+        z: difference over standard error.
+        p_value: two-sided p-value of z.
     """
 
     difference: float
@@ -27,14 +30,18 @@ class Comparison(NamedTuple):
 
     @property
     def decided(self) -> bool:
-        """Whether the data speak for one of them, at 5 %: for the first where the difference is positive."""
+        """True if the data speak for one law at 5 %, the first where the difference is positive."""
         return self.p_value < 0.05
 
 
 def compare_laws(a: Predictive, b: Predictive) -> Comparison:
-    """Test whether two laws foretell one recording equally well: z of the mean difference of log-likelihoods.
+    """Test whether two laws predict one recording equally well: z of the mean difference of log-likelihoods.
 
     Steps where nothing arrived do not count.
+
+    Args:
+        a: densities of the recording under the first law, from `predictive`.
+        b: densities of the same recording under the second.
 
     Raises:
         ValueError: different recordings, or fewer than 10 steps with a measurement.
@@ -51,7 +58,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
 
 
 def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
-    """The test of a mean difference."""
+    """Test a mean difference (steps,) against zero."""
     mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     return Comparison(mean, error, float(z), float(2 * norm.sf(abs(z))))

@@ -1,4 +1,4 @@
-"""What learning changed for a network's filters, on rows that were not learned from."""
+"""Comparison of a network's filters before and after learning, on rows that were not learned from."""
 
 from dataclasses import dataclass
 
@@ -22,9 +22,9 @@ LAGS = 10  # of the test for memory, with ten rows for each at least
 @readable
 @dataclass(frozen=True)
 class Expected:
-    """How well a filter expected some rows: log-likelihood of each, innovations in claimed deviations, their test.
+    """Predictions of some rows by one filter: log-likelihoods, white innovations and the test of their memory.
 
-    Shapes: log_likelihood (rows,), white (rows, received); the test is None where there are too few rows.
+    Shapes: log_likelihood (rows,), white (rows, received) in claimed deviations; the test is None for too few rows.
     """
 
     log_likelihood: Float[np.ndarray, " rows"]
@@ -35,9 +35,9 @@ class Expected:
 @readable
 @dataclass(frozen=True)
 class Change:
-    """One filter on the held-out rows, with the numbers that the network began with and with those learned.
+    """Filter on the held-out rows, with the numbers that the network began with and with those learned.
 
-    gain: of log-likelihood per row, with its test; None where fewer than 10 rows were heard.
+    gain: of log-likelihood per row, with its test; None where fewer than 10 rows arrived.
     """
 
     node: str
@@ -65,7 +65,7 @@ class Uniformity:
 def changes(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Change]:
-    """Every filter that claims a covariance, over all rows, judged from row `cut` on."""
+    """Compare every filter that claims a covariance, run over all rows and judged from row `cut` on."""
     results = []
     for name, z in measurements.items():
         for key, old in before.nodes[name].filters.items():
@@ -83,7 +83,7 @@ def changes(
 def uniformity(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
-    """Pits of each node: by its laws where `predictive` knows its channel, else by its first filter's Gaussians."""
+    """Probability integral transforms of each node: by its laws where known, else by its first filter's Gaussians."""
     result = []
     for name, z in measurements.items():
         local, node = [change for change in outcome if change.node == name], network.nodes[name]

@@ -1,4 +1,4 @@
-"""What a route does to second moments, which is all that data tell of it: mean gain, gain variance, noise."""
+"""Second moments of a route, all that data can identify of it: mean gain, gain variance, noise."""
 
 from typing import TYPE_CHECKING
 
@@ -20,12 +20,13 @@ KINDS = ("mean gain", "gain variance", "noise")
 
 
 def route_sentences(solution: "Solution") -> list[str]:
-    """Of each output: what is told of its mean gain, gain variance and noise, that of the sensor included."""
+    """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
     description = solution.surface.objective.description
     _, sensor, channel = joint_world(description.start)
     if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
         return []
 
+    # mean gain, gain variance, and M R M' + spread of the constant part, of each output
     def totals(x: Array) -> jax.Array:
         world = joint_world(description.at(description.parameters.values(x)))
         local, link = first(world[1]), first(world[2])
@@ -41,6 +42,7 @@ def route_sentences(solution: "Solution") -> list[str]:
     with jax.enable_x64(True):
         x = jnp.asarray(solution.x)
         values, slopes = np.asarray(totals(x)), np.asarray(jax.jacfwd(totals)(x))
+    # intervals by the derivatives, for what is identified
     covariance, freedom = solution.covariance()
     lines = []
     for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
@@ -52,5 +54,5 @@ def route_sentences(solution: "Solution") -> list[str]:
         ]
         if report:
             label = name if isinstance(name, str) else f"z{name}"
-            lines.append(f"Told of what arrives of {label}: {', '.join(report)}, 95 %, the sensor's noise included.")
+            lines.append(f"The received {label} has {', '.join(report)}, 95 %, the sensor's noise included.")
     return lines

@@ -32,6 +32,8 @@ def time_input(network: Network) -> int | None:
     for name, node in network.nodes.items():
         if isinstance(node, Node) and first(node.channel).remembers:
             raise fail("timeline", expected, f"a channel that remembers, at node {name!r}")
+        if isinstance(node, Node) and node.trigger is not None:
+            raise fail("timeline", expected, f"a sender with a trigger, at node {name!r}")
     return network.inputs.index(TIME_STEP)
 
 

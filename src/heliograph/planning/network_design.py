@@ -112,7 +112,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
 
 
 def _free(paths: Paths, free: Sequence[str] | None) -> Bool[np.ndarray, "hop"]:
-    """Which transmitters are free."""
+    """Mask of the free transmitters."""
     if free is None:
         names: Sequence[str] = paths.names
     else:

@@ -103,7 +103,7 @@ def test_in_a_world_without_memory_the_claim_is_the_truth():
 def test_claims_of_filters_that_assume_no_memory():
     assert hg.cubature_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.extended_filter(PLANT, SENSOR, bursts()).claim == "nominal"
-    assert hg.mixture_filter(PLANT, SENSOR, bursts()).claim == "nominal"
+    assert hg.filters.mixture_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.mean_gain_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.cubature_filter(PLANT, SENSOR, NOISE_ONLY).claim == "exact"
     assert hg.linear_filter(PLANT, SENSOR, bursts()).claim == "exact"

@@ -35,6 +35,7 @@ from heliograph.numerics.small_matrix import congruence, times, times_vector, tr
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
+from heliograph.random_affine.outliers import is_bounded
 
 
 class LinearBelief(NamedTuple):
@@ -247,6 +248,8 @@ def linear_filter(
     if first(channel).remembers:
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
+        if is_bounded(plant, sensor, channel):
+            raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         if first(channel).erases:
             return side_information_filter(plant, sensor, channel)
         if uncertain_chain(channel):
@@ -263,7 +266,7 @@ def linear_filter(
         channel=described,
         update=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
-        claim="upper" if whole.uncertain else "exact",
+        claim="upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact",
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,

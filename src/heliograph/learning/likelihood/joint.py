@@ -1,4 +1,4 @@
-"""All that the nodes of a network hear, as one sensor and one channel."""
+"""Sensor and channel of all nodes of a network together."""
 
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.clock import joint_sensor
@@ -14,7 +14,7 @@ from heliograph.simulation.node import Node
 
 
 def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
-    """Plant, sensor and channel of all nodes together, in their order, as if nothing that is told of were ever lost.
+    """Plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
 
     Raises:
         ValueError: relays that filter and forward, several nodes of which one varies over time.
@@ -42,7 +42,7 @@ def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
 
 
 def _joint_channel(channel: Channel) -> Channel:
-    """Losses that are told leave rows out; of a channel that remembers they tell its modes, and stay."""
+    """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
     if isinstance(channel, OverTime):

@@ -1,4 +1,4 @@
-"""What a fit maximises: a filter's likelihood as a function of the free numbers, with scores and information."""
+"""Objective of a fit: a filter's likelihood as a function of the free numbers, with scores and information."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -43,12 +43,12 @@ class Data(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Whether everything arrived, and nothing was put in."""
+        """True if everything arrived, and there are no inputs."""
         return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
 class Evaluation(NamedTuple):
-    """At points of the line: log-likelihoods and scores of each step, and the Gauss-Newton information of both halves.
+    """Log-likelihoods and scores of each step at points of the line, and the Gauss-Newton information of both halves.
 
     Shapes: density (points, recordings, steps), score (points, recordings, steps, p), halves (points, 2, p, p).
     """
@@ -59,12 +59,12 @@ class Evaluation(NamedTuple):
 
     @property
     def information(self) -> Float[np.ndarray, "points p p"]:
-        """The Gauss-Newton information of all data."""
+        """Gauss-Newton information of all data."""
         return np.asarray(self.halves.sum(axis=1))
 
     @property
     def late(self) -> Float[np.ndarray, "points p p"]:
-        """The information of the second half, to which the initial state adds nothing."""
+        """Information of the second half, to which the initial state adds nothing."""
         return np.asarray(self.halves[:, 1])
 
     @property
@@ -80,15 +80,21 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The filter of one form, from numbers on the line. Equal ones share a compiled program.
+    """Filter of one form, as a function of numbers on the line. Equal ones share a compiled program.
 
-    settles: it is a `LinearFilter` of which nothing varies over time. random: so are gains. A function may read numbers
-    that live outside of it; that these are others now is seen by the network that it returns at the start.
+    A function may read numbers that live outside of it; a change of these shows in the network that it returns at the
+    start.
+
+    Args:
+        description: the network with its free numbers.
+        form: "linear" or "conditional".
+        steady: true for a `LinearFilter` of which nothing varies over time, so that its gains reach a steady state.
+        random: true if gains are random, so that gains of the filter depend on the state's second moment.
     """
 
     description: Description
     form: Form
-    settles: bool
+    steady: bool
     random: bool
 
     def __eq__(self, other: object) -> bool:
@@ -101,11 +107,11 @@ class Objective:
         return self.form, self.description, self.description.start
 
     def filter(self, x: Array) -> AbstractFilter:
-        """The filter at a point of the line."""
+        """Filter at a point of the line."""
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """z less what is expected (steps, m), NaN where nothing arrived, and its covariance (steps, m, m)."""
+        """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
         item = self.filter(x)
 
         def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
@@ -121,18 +127,18 @@ class Objective:
 
 
 def objectives(network: Description) -> list[Objective]:
-    """Those that the network allows, the linear one first.
+    """Objectives that the network allows, the linear one first.
 
-    Linear: the spread of a random gain by the state's own moments, for linear plants; its score has mean zero whatever
-    the laws. Conditional: by what is known of the state, for channels that neither remember nor are late. Without a
+    Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
+    whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
     random gain both are the same, the first.
 
     Raises:
         ValueError: a network whose likelihood no filter here knows.
     """
     built = network.start
-    forms, settles = forms_of(built), _settles(built)
-    return [Objective(network, form, settles and form == "linear", len(forms) > 1) for form in forms]
+    forms, steady = forms_of(built), _is_steady(built)
+    return [Objective(network, form, steady and form == "linear", len(forms) > 1) for form in forms]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -149,15 +155,15 @@ def forms_of(network: Network) -> list[Form]:
     return ["linear", "conditional"]
 
 
-def _settles(network: Network) -> bool:
-    """Whether the linear filter is one that neither remembers nor waits, and nothing varies over time."""
+def _is_steady(network: Network) -> bool:
+    """Decide whether the linear filter is one without memory or delay, of which nothing varies over time."""
     world = joint_world(network)
     item = first(world[2])
     return not item.remembers and not item.past and not any(isinstance(part, OverTime) for part in world)
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
-    """The filter that hears all that the network's nodes hear, whose likelihood is of this form."""
+    """Filter of all that the network's nodes receive, whose likelihood is of this form."""
     plant, sensor, channel = joint_world(network)
     if form == "linear":
         return linear_filter(plant, sensor, channel)
@@ -167,11 +173,11 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
     """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
 
-    Where gains settle, one at a time: there is enough to do side by side within a recording.
+    Where gains reach a steady state, one at a time: there is enough to do in parallel within a recording.
     """
     every: dict[int, Evaluation] = {}
     with jax.enable_x64(True):
-        for i, point in enumerate(x if objective.settles and data.plain else ()):
+        for i, point in enumerate(x if objective.steady and data.plain else ()):
             result, converged = to_numpy(_with_steady_gains(objective, point, data.measurements))
             if converged:
                 every[i] = result
@@ -197,7 +203,7 @@ def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evalua
 
     item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
     slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
-    assert isinstance(item, LinearFilter)  # the objective settles
+    assert isinstance(item, LinearFilter)  # as of every steady objective
     received, derivatives, converged = steady_gains.innovations(item, slopes, z, objective.random)
     scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
     result = Evaluation(
@@ -207,13 +213,13 @@ def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evalua
 
 
 def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """At one point: (recordings, steps), (recordings, steps, p), (2, p, p)."""
+    """Evaluation at one point: density (recordings, steps), score (recordings, steps, p), halves (2, p, p)."""
     result = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
     return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """Of one recording: density (steps,), score (steps, p) and information (2, p, p).
+    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p).
 
     s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
     components that arrived; derivatives run forward through the scan.
@@ -229,11 +235,13 @@ def _scored(
     p, steps, m = de.shape
     e, z, s = e.T, z.T[:m], jnp.moveaxis(s, 0, -1)  # time last, as the kernels of small matrices want it
     de, ds = jnp.moveaxis(de, (0, 1), (1, 2)), jnp.moveaxis(ds, (0, 1), (2, 3))
+    # components that arrived, and the log-density of their innovation
     present = ~jnp.isnan(e)
     both = present[:, None] & present
     density = log_density(e, s, jnp.abs(z) + jnp.abs(z - e))
     e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
     de, ds = jnp.where(present[:, None], de, 0.0), jnp.where(both[:, :, None], ds, 0.0)
+    # S^-1 (e, de, dS) by one factorisation, then score and information
     right = jnp.concatenate([e[:, None], de, jnp.reshape(jnp.swapaxes(ds, 1, 2), (m, p * m, steps))], axis=1)
     solved = solve(s, right)
     w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m, steps)  # S^-1 (e, de, dS)

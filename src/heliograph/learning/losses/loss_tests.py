@@ -1,4 +1,4 @@
-"""Whether losses remember: a likelihood ratio against a first-order chain, and the number of runs."""
+"""Tests of losses for memory: a likelihood ratio against a first-order chain, and the number of runs."""
 
 from typing import NamedTuple
 
@@ -13,11 +13,14 @@ from heliograph.numerics.readable import readable
 
 @readable
 class LossMemory(NamedTuple):
-    """What two tests say of losses that are independent by assumption.
+    """Result of two tests of losses that are independent by assumption.
 
-    likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known, chi-square with one
-    degree of freedom if the losses are independent, and its p-value. runs_z: the number of runs of equal fates, less
-    what is expected, in standard deviations: negative where losses come in bursts; its two-sided p-value.
+    Args:
+        likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known; chi-square with
+            one degree of freedom if the losses are independent.
+        likelihood_p: its p-value.
+        runs_z: number of runs of equal fates, less what is expected, in standard deviations: negative for bursts.
+        runs_p: its two-sided p-value.
     """
 
     likelihood_ratio: float
@@ -27,12 +30,15 @@ class LossMemory(NamedTuple):
 
     @property
     def significant(self) -> bool:
-        """Whether the likelihood ratio rejects independence at 1 %."""
+        """True if the likelihood ratio rejects independence at 1 %."""
         return self.likelihood_p < 0.01
 
 
 def loss_memory(fates: object) -> LossMemory:
-    """Test told losses for memory; where nothing varies there is no evidence, p = 1.
+    """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
+
+    Args:
+        fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
 
     Raises:
         ValueError: what is no fates (see `heliograph.learning`).
@@ -41,6 +47,7 @@ def loss_memory(fates: object) -> LossMemory:
     counts = MarkovLosses.fit(fates).counts
     both = counts.sum(axis=0)
     ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
+    # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
     off, variance = 0.0, 0.0
     for part in as_fates(fates):
         for lost in _unbroken(part):
@@ -53,7 +60,7 @@ def loss_memory(fates: object) -> LossMemory:
 
 
 def _likelihood(counts: np.ndarray) -> float:
-    """sum n_ab log(n_ab / n_a)."""
+    """Log-likelihood sum n_ab log(n_ab / n_a)."""
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 

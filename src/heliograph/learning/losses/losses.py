@@ -1,4 +1,4 @@
-"""Losses learned from a recording: what each law says of them, whether they remember, and which law foretells best."""
+"""Losses learned from a recording: laws fitted to them, tests of their memory, and the law that predicts best."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ LONG = 4  # packets back that the longer of the two chains looks
 
 
 class HeldOutScores(NamedTuple):
-    """What a law says of packets that it was not fitted to.
+    """Scores of a law on packets that it was not fitted to.
 
-    log_likelihood: mean over packets, nats. gain: more than independent losses say, with its standard error, which
-    allows for correlation over time.
+    log_likelihood: mean over packets, nats. gain: difference from that of independent losses; gain_error: its standard
+    error, which allows for correlation over time.
     """
 
     log_likelihood: float
@@ -35,11 +35,16 @@ class HeldOutScores(NamedTuple):
 @readable
 @dataclass(frozen=True)
 class Losses:
-    """What a recording says of losses.
+    """Losses of a recording: fitted laws, tests of memory, and how well each law predicts.
 
-    laws: fitted to all packets, by name: "independent", "markov", "markov_4", "hidden", "running". held_out: how each,
-    fitted to the earlier packets alone, foretells the later ones; empty where one part is too short. best: the name of
-    the law that foretells best, "hidden" where nothing was held out. memory: tests of independence on all packets.
+    Args:
+        packets: number of packets whose fate is known.
+        lost: number of these that were lost.
+        laws: fitted to all packets, by name: "independent", "markov", "markov_4", "hidden", "running".
+        memory: tests of independence on all packets.
+        held_out: scores of each law on the later packets, when fitted to the earlier ones alone; empty where one part
+            is too short.
+        best: name of the law that predicts best, "hidden" where nothing was held out.
     """
 
     packets: int
@@ -50,18 +55,19 @@ class Losses:
     best: str
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """The link with the losses of the law that foretells best among those that a channel can have."""
+        """Link with the losses of the law that predicts best among those that a channel can have."""
         able = [name for name in self.laws if name != RUNNING]
         name = max(able, key=lambda item: self.held_out[item].log_likelihood) if self.held_out else self.best
         return self.laws[name].channel(link)
 
 
 def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
-    """Fit four kinds of laws to told losses, test for memory, and choose by what the laws say of the later packets.
+    """Fit four kinds of laws to losses, test for memory, and choose by how well the laws predict the later packets.
 
-    `fates`: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
-    `fates_of_sequence`, `fates_by_node`, `fates_by_hop` and `fates_of_measurements` give them. `held_out`: the share of
-    the packets, the last ones, that only choose.
+    Args:
+        fates: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
+            `fates_of_sequence`, `fates_by_node`, `fates_by_hop` and `fates_of_measurements` give them.
+        held_out: share of the packets, the last ones, that are not fitted to but choose; a third by default.
 
     Raises:
         ValueError: what is no fates, a share outside [0, 1).
@@ -79,7 +85,11 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict[str, Losses]:
-    """The same for each node or hop, by its name.
+    """Learn the losses of each node or hop, by its name.
+
+    Args:
+        fates: {name: fates}, as `fates_by_node` and `fates_by_hop` give them.
+        held_out: share of the packets that choose, as in `learn_losses`.
 
     Raises:
         ValueError: as `learn_losses`.

@@ -12,9 +12,14 @@ STARTS = (logits(0.2, 0.8, 0.05), logits(0.2, 0.5, 0.3), logits(0.2, 0.95, 0.01)
 
 
 class RunningRateLosses(AbstractLossLaw):
-    """P(lost) = (1 - weight) base + weight r, with the running rate r <- r + step (lost - r) after each known fate.
+    """Losses whose rate drifts: P(lost) = (1 - weight) base + weight r, r <- r + step (lost - r) after a known fate.
 
-    A yardstick for the others: where it foretells as well as a hidden mode, the rate drifts. No channel has it.
+    A yardstick for the others: where it predicts as well as a hidden mode, the rate drifts. No channel has it.
+
+    Args:
+        base: rate from which r begins, and to which the probability is drawn.
+        weight: share of the running rate r in the probability.
+        step: share of the last fate in the running rate.
     """
 
     base: Share
@@ -23,7 +28,7 @@ class RunningRateLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object, intervals: bool = True) -> "RunningRateLosses":
-        """Maximum likelihood from three starts, with intervals by the profile of the likelihood.
+        """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
 
         Raises:
             ValueError: what is no fates.
@@ -42,11 +47,11 @@ class RunningRateLosses(AbstractLossLaw):
         return RunningRateLosses(*shares_at(likelihood, top, value, intervals))
 
     def shares(self) -> dict[str, Share]:
-        """The three numbers with likelihood intervals."""
+        """Base, weight and step with likelihood intervals."""
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """From the running rate; an unknown fate leaves it where it is."""
+        """Probability of each loss by the running rate; an unknown fate leaves it where it is."""
         known = ~np.isnan(fate)
         at_known = _ahead(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[0]
         return np.asarray(at_known[np.cumsum(known) - known])
