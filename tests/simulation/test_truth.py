@@ -5,6 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.cli.run import run as command
+from heliograph.report.health import examine
+from heliograph.report.run_page import errors_table, run_summary
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3, outputs=["range"])
@@ -75,6 +77,20 @@ def test_a_column_holds_the_truth(tmp_path):
 def test_a_truth_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="truth: expected"):
         hg.run(NETWORK, {"a": np.zeros(4)}, truth=np.zeros((3, 2)))
+
+
+def test_the_report_shows_the_errors():
+    single = hg.simulate(NETWORK, 40, 3)
+    record = hg.run(NETWORK, single.measurements, truth=single.truth)
+    health = examine(NETWORK, record, np.zeros((40, 0)))
+    (table,) = errors_table(record)
+    assert table.headers == ["filter", "claim", "RMSE of place", "RMSE of speed", "NEES"]
+    rmse = record.rmse("a", "f")
+    size = record.nees("a", "f").mean() / 2
+    assert table.rows == [["a/f", "exact", f"{rmse['place']:.4g}", f"{rmse['speed']:.4g}", f"{size:.3g}"]]
+    errors = run_summary(health)["errors"]["a"]["f"]
+    assert errors == {"rmse": rmse, "nees": pytest.approx(size)}
+    assert errors_table(hg.run(NETWORK, single.measurements)) == []
 
 
 def test_the_command_says_how_far_off(tmp_path, capsys):

@@ -121,8 +121,8 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     if not any(name in columns for name in true.values()):
         return Recording(measurements, u, time)
     unknown = np.full(len(time), np.nan)
-    known = [true.get(state) for state in network.states]
-    truth = [unknown if name not in columns else _measured(columns, name, source) for name in known]
+    known = [true.get(state, "") for state in network.states]
+    truth = [_measured(columns, name, source) if name in columns else unknown for name in known]
     return Recording(measurements, u, time, np.stack(truth, axis=1))
 
 

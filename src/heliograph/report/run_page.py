@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
+from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -127,11 +128,26 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         + _agreement(health, doubts),
         sections=[
             Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
-            Section("Estimates", estimates),
+            Section("Estimates", [*errors_table(record), *estimates]),
             Section("Innovations", _tests(health, drawings)),
             Section("Links", _health(health, drawings)),
         ],
     )
+
+
+def errors_table(record: Record) -> list[Table]:
+    """Return the errors of each filter where the recording has the true state."""
+    rows = [
+        [visible(f"{item.node}/{item.filter}"), item.claim, *(f"{value:.4g}" for value in item.rmse.values()),
+         "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
+        for item in errors_of(record)
+    ]  # fmt: skip
+    caption = (
+        "Root mean square error of each state against the truth in the recording. **NEES**: squared error over the "
+        "claimed one, per state: 1 where the claim holds, above 1 too sure."
+    )
+    headers = ["filter", "claim", *(visible(f"RMSE of {state}") for state in record.states), "NEES"]
+    return [Table(headers, rows, caption)] if rows else []
 
 
 def _agreement(health: Health, doubts: list[str]) -> str:
@@ -224,6 +240,12 @@ def run_summary(health: Health) -> dict[str, Json]:
                 "p_value": filter_.test.p_value,
             }
         filters.setdefault(filter_.node, {})[filter_.filter] = results
+    # Errors, where the truth is known.
+    errors: dict[str, dict[str, Json]] = {}
+    for item in errors_of(health.record):
+        size = None if np.isnan(item.nees) else item.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in item.rmse.items()}
+        errors.setdefault(item.node, {})[item.filter] = {"rmse": rmse, "nees": size}
     # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
@@ -232,6 +254,7 @@ def run_summary(health: Health) -> dict[str, Json]:
         "rows": len(health.record.time),
         "warnings": health.warnings(),
         "filters": filters,
+        "errors": errors,
         "links": links,
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},
     }

@@ -143,7 +143,7 @@ class Record(Saved):
         if estimate.claim == "none":
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
-        return nees(self.truth, np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
+        return nees(np.asarray(self.truth), np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
