@@ -19,6 +19,7 @@ Region = Literal["box", "ball", "each"]
 Losses = Literal["unknown", "numbered", "known"]
 
 
+@readable
 class SendReason:
     """Why a sender transmits; negative in a record where the transmission was lost, 0 where it sent nothing."""
 

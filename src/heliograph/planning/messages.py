@@ -16,6 +16,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
@@ -28,6 +29,7 @@ LONGEST = 100  # deviations of a step from 0, beyond which there are too many no
 REACH = 12.0  # deviations at which a density ends
 
 
+@readable
 class MessageRate(NamedTuple):
     """Rate of messages and mean square errors, with their standard errors, which are 0 where they are exact.
 

@@ -9,12 +9,14 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.rows import BEFORE, HeldRow, Rows
+from heliograph.live.senders import SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
 from heliograph.serving.pool import Pool
+from heliograph.simulation.node import Node
 
 FAR = 10_000  # steps that an event may be after the newest one: each of them has to be computed, while others wait
 
@@ -72,6 +74,8 @@ class Fleet:
         self._end = np.inf if covered is None else covered - 1
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
         self._joint = self.lanes.dt is None or network.common is not None
+        # Nodes whose sender decides when to send.
+        self.deciding = {n: v for n, v in network.nodes.items() if isinstance(v, Node) and v.trigger is not None}
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.start(self._blank, -1.0)
@@ -159,6 +163,13 @@ class Fleet:
         """Return the outputs of the filters after the rows in these slots."""
         results: list[list[float]] = self.pool.table[slots, self.pool.outputs].tolist() if slots else []
         return results
+
+    def senders(self, plant: Plant) -> dict[str, SenderStatus]:
+        """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
+        final, now = int(np.ceil(plant.now - self.options.window)) - 1, int(np.floor(min(plant.now, self._end)))
+        links = {name: plant.links.get(name) for name in self.deciding}
+        last = {name: int(link.at) if link is not None and link.used else None for name, link in links.items()}
+        return {name: sender_status(node, last[name], final, now) for name, node in self.deciding.items()}
 
     def forget(self, finalised: Iterable[Finalised]) -> None:
         """Free the slots of these rows, once their outputs have been read."""

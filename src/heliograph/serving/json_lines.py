@@ -1,10 +1,12 @@
 """Estimates and refusals as lines of JSON."""
 
+from collections.abc import Mapping
 from math import isfinite
 
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
+from heliograph.live.senders import SenderStatus
 from heliograph.serving.lanes import Lanes, Place
 
 
@@ -17,13 +19,18 @@ class Teller:
         for place in lanes.places:
             self._nodes.setdefault(place.node, []).append(place)
 
-    def estimates(self, kind: str, plant: str, time: float | str, outputs: list[float]) -> bytes:
-        """Return a line with the estimates of all filters after a row, from the outputs of that row."""
+    def estimates(
+        self, kind: str, plant: str, time: float | str, outputs: list[float], senders: Mapping[str, SenderStatus]
+    ) -> bytes:
+        """Return a line with the estimates of all filters after a row, from its outputs, and the senders."""
         results = {
             node: {place.filter: self._filter(place, outputs) for place in places}
             for node, places in self._nodes.items()
         }
-        return line({"kind": kind, "plant": plant, "time": time, "estimates": results})
+        parts: dict[str, object] = {"kind": kind, "plant": plant, "time": time, "estimates": results}
+        if senders:
+            parts["senders"] = {name: status._asdict() | {"dead": status.dead} for name, status in senders.items()}
+        return line(parts)
 
     def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
         n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement

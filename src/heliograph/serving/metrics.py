@@ -21,6 +21,7 @@ class Tallies(Collector):
         """Yield the current metrics."""
         yield from _links(self.watch)
         yield from _nis(self.watch)
+        yield _dead(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
@@ -42,6 +43,14 @@ def _links(watch: Watch) -> Iterable[Metric]:
         lost.add_metric([node], tally["lost"])
         dropped.add_metric([node], tally["dropped"])
     return messages, lost, dropped
+
+
+def _dead(watch: Watch) -> Metric:
+    what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance."
+    dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
+    for node, count in watch.dead_senders().items():
+        dead.add_metric([node], count)
+    return dead
 
 
 def _nis(watch: Watch) -> Iterable[Metric]:

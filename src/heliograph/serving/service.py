@@ -92,6 +92,14 @@ class Service:
         self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
 
+    def dead_senders(self) -> dict[str, int]:
+        """Count the plants in memory that have a dead sender, by node whose sender decides when to send."""
+        dead = dict.fromkeys(self.fleet.deciding, 0)
+        for plant in self.plants.values() if dead else ():
+            for node, status in self.fleet.senders(plant).items():
+                dead[node] += status.dead
+        return dead
+
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
         return self.store.unpublished()
@@ -206,7 +214,8 @@ class Service:
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
-        return self._teller.estimates(kind, plant.name, moment, outputs)
+        senders = self.fleet.senders(plant) if kind == "provisional" else {}
+        return self._teller.estimates(kind, plant.name, moment, outputs, senders)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -80,6 +80,9 @@ class Serves(Takes, Protocol):
     def last(self) -> Taken:
         """Return the statistics of the last batch."""
 
+    def dead_senders(self) -> Mapping[str, int]:
+        """Return how many plants have a dead sender, by node with a trigger."""
+
 
 class Point(NamedTuple):
     """Estimates of a plant at one time: means and standard deviations by node and filter. `number` counts the points.
@@ -152,6 +155,13 @@ class Watch:
     def links(self) -> dict[str, dict[str, int]]:
         """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits."""
         return _added(plant for _, plant in self.plants())
+
+    def dead_senders(self) -> Mapping[str, int]:
+        """Count the plants that have a dead sender, by node with a trigger, over all services."""
+        total = Counter[str]()
+        for service in self.services:
+            total.update(service.dead_senders())  # adds, and holds zeros
+        return total
 
     def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
         """Return the data of the page for a plant (None: the one with the newest message), after the point `since`."""
