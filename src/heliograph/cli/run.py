@@ -147,7 +147,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.disk.output_folder import check_replaceable
+        from heliograph.disk.output_file import check_replaceable
         from heliograph.report.results import NEEDS, SUMMARY
 
         for name in NEEDS:

@@ -17,6 +17,8 @@ from .gaussian.correction import (
 )
 from .wrappers.delay import (
     late_filter as late_filter,
+)
+from .wrappers.part import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (

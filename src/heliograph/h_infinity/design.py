@@ -20,14 +20,7 @@ from heliograph.h_infinity.solver import (
     check_choice,
     run_solver,
 )
-from heliograph.h_infinity.step import (
-    Layout,
-    StepMatrices,
-    Unknowns,
-    all_multipliers,
-    next_energy,
-    step_matrices,
-)
+from heliograph.h_infinity.step import Layout, StepMatrices, Unknowns, all_multipliers, next_energy, step_matrices
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.readable import readable

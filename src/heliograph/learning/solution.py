@@ -6,16 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.intervals import (
-    DRAWS,
-    LEVEL,
-    Method,
-    Scores,
-    block_sums,
-    long_run,
-    quantile,
-    sandwich,
-)
+from heliograph.learning.intervals import DRAWS, LEVEL, Method, Scores, block_sums, long_run, quantile, sandwich
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.surface import REACH, Surface
 from heliograph.learning.likelihood.transforms import link, unlink

@@ -16,8 +16,8 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.same import same
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

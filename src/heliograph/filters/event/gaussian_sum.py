@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, join, log_total, reduced, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, predicted
@@ -16,7 +16,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
@@ -53,7 +53,7 @@ class EventBelief(NamedTuple):
         return EventBelief(jnp.exp(parts.log_weight), *parts[1:], begun, moved)
 
 
-class EventFilter(AbstractFilter):
+class EventFilter(AbstractSizedFilter):
     """The Gaussian sum of `event_filter`.
 
     known: parts of the interval in which y - r lay last, one Gaussian each; lost: Gaussians whose reference is a value
@@ -72,10 +72,6 @@ class EventFilter(AbstractFilter):
     loses: bool = eqx.field(static=True)
     delivers: bool = eqx.field(static=True)
     alike: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
 
     @property

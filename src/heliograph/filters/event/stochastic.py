@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.correction import Signal
@@ -19,7 +19,7 @@ from heliograph.filters.modes.mode_observations import receive
 from heliograph.filters.modes.side_information import SideInformation, with_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
@@ -39,7 +39,7 @@ class StochasticBelief(NamedTuple):
     moved: jax.Array
 
 
-class StochasticEventFilter(AbstractFilter):
+class StochasticEventFilter(AbstractSizedFilter):
     """The filter of `event_filter` behind a `StochasticTrigger` or `Periodic`.
 
     Silence of probability exp(-(y - r)' W (y - r) / 2) is r, measured of y with the noise W^-1: a Kalman update. Where
@@ -54,10 +54,6 @@ class StochasticEventFilter(AbstractFilter):
     initial: Float[Array, " M"]
     transform: AbstractTransform
     loses: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
 
     @property

@@ -2,13 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
@@ -24,7 +23,7 @@ from heliograph.filters.gaussian.scores import (
 )
 from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
@@ -46,7 +45,7 @@ class AdaptiveBelief(NamedTuple):
     scale: Float[jax.Array, " m"]
 
 
-class AdaptiveFilter(AbstractFilter):
+class AdaptiveFilter(AbstractSizedFilter):
     """Gaussian or robust filter whose noise variances are learned. Built by `adaptive_filter`.
 
     Of each component that arrived, with a_0, b_0 of the filter's own variance r = b_0 / a_0:
@@ -69,10 +68,6 @@ class AdaptiveFilter(AbstractFilter):
     base: GaussianFilter | RobustFilter
     noise: ReceivedNoise | OverTime
     memory: Float[jax.Array | np.ndarray, ""]
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> AdaptiveBelief:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import describe
 from heliograph.filters.gaussian.rounding import above_rounding, initial_size
@@ -23,7 +23,7 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -50,7 +50,7 @@ class LinearBelief(NamedTuple):
     state_covariance: Float[jax.Array, "n n"]
 
 
-class LinearFilter(AbstractFilter):
+class LinearFilter(AbstractSizedFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind a random affine channel z = G y + n.
 
     With y = C x + v, M = E[G] and Y = E[y y'] = C E[x x'] C' + R:
@@ -75,10 +75,6 @@ class LinearFilter(AbstractFilter):
     channel: SecondOrder | OverTime
     update: Polytope
     mean_known: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> LinearBelief:

@@ -20,9 +20,9 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.erasure import arrived
 
 NODES = 64  # values of each law: a hop's density to three digits where its noise is a tenth of its spread
 ROWS = 256  # steps whose densities are computed at once
