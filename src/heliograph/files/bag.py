@@ -191,6 +191,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
             for path_ in (*source.paths, source.time, source.sequence, source.plant)
             if path_
         ]
+        # What is needed is a field, a message with fields, or in a list.
         if needed and not fields:
             what = f"{path}, {connection.topic}"
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")

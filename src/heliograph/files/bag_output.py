@@ -132,7 +132,7 @@ def _types() -> Any:
 def _nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     """Convert times to nanoseconds since 1970: dates, or seconds or steps from an origin."""
     if time.dtype.kind == "M":
-        return time.astype("datetime64[ns]").astype(np.int64).tolist()
+        return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
     begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
     return [begun + round(at * 1e9) for at in time.tolist()]
 
@@ -161,6 +161,7 @@ def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Itera
         for node, filters in record.estimates.items()
         for name, e in filters.items()
     ]
+    # Row by row, in order of time.
     for k, stamp in enumerate(times):
         for prefix, mean, covariance, claims, sound in parts:
             if not sound[k]:
@@ -207,11 +208,11 @@ def _part(
     """Return the six numbers of pose or twist, and their covariance, row by row."""
     numbers = [0.0 if place is None else float(mean[place]) for place in places]
     bound = np.zeros((6, 6))
-    there = [axis for axis, place in enumerate(places) if place is not None]
+    named = [(axis, place) for axis, place in enumerate(places) if place is not None]
     if covariance is None:
         bound[0, 0] = UNKNOWN
-    elif there:
-        states = [places[axis] for axis in there]
+    elif named:
+        there, states = np.array(named).T
         bound[np.ix_(there, there)] = covariance[np.ix_(states, states)]
     return numbers, bound.ravel()
 

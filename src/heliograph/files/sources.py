@@ -287,7 +287,7 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
     """
-    # Stamps of two whole numbers, then dates, then numbers.
+    # Stamps of two whole numbers.
     for pair in STAMPS if not isinstance(value, int | float | str) else ():
         if isinstance(value, Mapping) and set(pair) <= value.keys():
             value = int(value[pair[0]]) * 10**9 + int(value[pair[1]])
@@ -296,6 +296,7 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
             value = int(getattr(value, pair[0])) * 10**9 + int(getattr(value, pair[1]))
             unit = "ns"
             break
+    # Dates, then numbers in their unit.
     if isinstance(value, str):
         try:
             instant(value)

@@ -88,7 +88,10 @@ def is_sound(estimate: Estimate) -> np.ndarray:
 
 
 def with_sound_claim(estimate: Estimate) -> Estimate:
-    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none."""
-    if estimate.claim == "none" or is_sound(estimate).all():
+    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none.
+
+    Several keep theirs: `claims` says of which it holds.
+    """
+    if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or is_sound(estimate).all():
         return estimate
     return Estimate(estimate.mean, estimate.covariance, "none")

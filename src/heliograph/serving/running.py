@@ -134,6 +134,7 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
             await serve_until(stop, look(service), transport)
     finally:
         store.close()
+    # What was not used, in words.
     for left in [] if reads is None else reads.left_out():
         _say(left)
     if resumed and service.known:

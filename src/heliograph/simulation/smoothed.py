@@ -122,6 +122,9 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
     """
     instance("smooth", smoothing, AbstractSmoothing, "one such as hg.smoothing.FixedInterval()")
     smoothing.check(horizon)
+    if network.meshes:
+        between = f"fusions between neighbours {list(network.meshes)}"
+        raise fail("smoothing", "filters, and fusions at a centre", between)
     # Relays send filtered estimates: the receiver alone is smoothed.
     part = network
     if network.relays is not None:

@@ -1,10 +1,16 @@
 """Fusions between neighbours in a network: runs, recordings, statistics, claims, and what is refused."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.service import Service
+from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.simulation.centres.mesh import mesh_of
 from tests.fusion.mesh.worlds import PLANT, RING, ROWS, network
 
@@ -276,6 +282,20 @@ def test_a_timeline_has_every_node_where_no_message_gets_lost(lossy):
 
 
 @pytest.mark.slow
+def test_a_service_has_every_node_where_no_message_gets_lost():
+    whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
+    z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}
+    expected = hg.run(whole, z).estimates["b"]["trace"]
+    service = Service(Fleet(Lanes(whole), Options(5.0)), InMemoryStore())
+    order = [(k, name) for k in range(3) for name in ("a", "c", "d")]
+    sent = [{"node": n, "sequence": k, "time": k, "values": z[n][k].tolist()} for k, n in order]
+    result = [json.loads(item.body) for item in service.take([json.dumps(item).encode() for item in sent])][-1]
+    estimate = result["estimates"]["b"]["trace"]
+    assert estimate["mean"] == pytest.approx(np.asarray(expected.mean)[-1].tolist(), rel=1e-9)
+    assert estimate["claim"] == "upper"
+
+
+@pytest.mark.slow
 def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
     """Rows sorted into parts by their length give what padded rows give."""
     generator = np.random.default_rng(0)
@@ -294,6 +314,11 @@ def test_parts_of_a_large_graph_are_the_whole(monkeypatch):
         results.append([hg.simulation.mesh_errors(net, name, arrived).actual for name in ("m", "d")])
     assert results[0][0] == pytest.approx(results[1][0], rel=1e-12)
     assert results[0][1] == pytest.approx(results[1][1], rel=1e-12)
+
+
+def test_estimates_between_neighbours_are_not_smoothed(lossy):
+    with pytest.raises(ValueError, match="smoothing: expected filters, and fusions at a centre"):
+        hg.monte_carlo(lossy, 4, 1, 0, smooth=hg.smoothing.FixedInterval())
 
 
 def test_arrivals_of_a_recording_have_their_shape(lossy):

@@ -69,7 +69,9 @@ def by_name(
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """
     result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
-    for (group, filters), part in zip(network.kinds + network.mesh_kinds, batch["estimates"], strict=True):
+    parts = batch["estimates"]
+    kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
+    for (group, filters), part in zip(kinds, parts, strict=True):
         values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
         for name, rows in zip(filters, values, strict=True):
             for node, row in zip(network.groups[group], rows, strict=True):
