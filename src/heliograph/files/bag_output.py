@@ -22,7 +22,7 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # rows of the covariance of a po
 UNKNOWN = -1.0  # first entry of a covariance that is not known, as messages of ROS have it
 ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
 
-StateName = TypeAliasType("StateName", str | None)  # of a state of the plant, if it is there
+State = TypeAliasType("State", str | None)  # of a state of the plant, if it is there
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,18 @@ class Pose:
         child: name of the frame that moves.
     """
 
-    x: StateName = None
-    y: StateName = None
-    z: StateName = None
-    roll: StateName = None
-    pitch: StateName = None
-    yaw: StateName = None
-    vx: StateName = None
-    vy: StateName = None
-    vz: StateName = None
-    vroll: StateName = None
-    vpitch: StateName = None
-    vyaw: StateName = None
+    x: State = None
+    y: State = None
+    z: State = None
+    roll: State = None
+    pitch: State = None
+    yaw: State = None
+    vx: State = None
+    vy: State = None
+    vz: State = None
+    vroll: State = None
+    vpitch: State = None
+    vyaw: State = None
     frame: str = "map"
     child: str = "base_link"
 
