@@ -52,14 +52,14 @@ def fates(drive: Drive) -> list[np.ndarray]:
 def losses(drive: Drive) -> Loss:
     """The losses of a drive, learned from its gaps."""
     parts = fates(drive)
-    losses = hg.learning.learn_losses(parts)
-    chain, single = losses.laws["markov"], losses.laws["independent"]
+    learned = hg.learning.learn_losses(parts)
+    chain, single = learned.laws["markov"], learned.laws["independent"]
     shares = chain.shares()
     gain = float(np.nansum(chain.log_likelihoods(parts)) - np.nansum(single.log_likelihoods(parts)))
     return Loss(
-        losses.packets, losses.lost / losses.packets, float(shares["fail"].estimate),
+        learned.packets, learned.lost / learned.packets, float(shares["fail"].estimate),
         float(shares["recover"].estimate), gain,
-        {name: float(part.mean()) for name, part in zip(drive.names, parts, strict=True)}, losses.best,
+        {name: float(part.mean()) for name, part in zip(drive.names, parts, strict=True)}, learned.best,
     )  # fmt: skip
 
 
