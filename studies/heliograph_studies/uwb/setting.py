@@ -129,7 +129,8 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
 
     def ranges(x: jax.Array) -> jax.Array:
         across = jnp.sqrt((x[0] - anchors[:, 0]) ** 2 + (x[1] - anchors[:, 1]) ** 2 + (HEIGHT - anchors[:, 2]) ** 2)
-        return across + numbers.excess + errors.ranges @ x[4:]
+        result: jax.Array = across + numbers.excess + errors.ranges @ x[4:]
+        return result
 
     sensor = hg.Sensor(ranges, law_of(rule, numbers, count), outputs=[f"range{i}" for i in range(count)])
     if rule == "plain":
