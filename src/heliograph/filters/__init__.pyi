@@ -1,8 +1,5 @@
 """Public names of the room; the package loads them when first used."""
 
-from .gaussian.adaptive import (
-    AdaptiveFilter as AdaptiveFilter,
-)
 from .base import (
     AbstractFilter as AbstractFilter,
     corrects as corrects,
@@ -62,9 +59,6 @@ from .wrappers.prediction import (
 from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
-)
-from .gaussian.robust import (
-    RobustFilter as RobustFilter,
 )
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,

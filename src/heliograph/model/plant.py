@@ -22,6 +22,7 @@ from heliograph.random_affine.noise import (
     Gaussian,
     Independent,
     Matrix,
+    NoiseLike,
     Square,
     Vector,
     as_noise,
@@ -29,7 +30,8 @@ from heliograph.random_affine.noise import (
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 A = TypeVar("A", jax.Array, np.ndarray)
-NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), from the input u
+TransitionFunction = TypeAliasType("TransitionFunction", Callable[[jax.Array, jax.Array], ArrayLike])  # f(x, u)
+NoiseFunction = TypeAliasType("NoiseFunction", Callable[[jax.Array], ArrayLike])  # Cov w (n, n) of the input u
 
 
 @readable
@@ -118,10 +120,10 @@ class Plant(AbstractPlant):
 
     def __init__(
         self,
-        transition: Callable[[jax.Array, jax.Array], ArrayLike],
-        noise: AbstractNoise | ArrayLike | NoiseFunction,
+        transition: TransitionFunction,
+        noise: NoiseLike | NoiseFunction,
         initial_mean: ArrayLike,
-        initial_covariance: AbstractNoise | ArrayLike,
+        initial_covariance: NoiseLike,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
         circular: Sequence[str] = (),
@@ -168,9 +170,9 @@ class LinearPlant(AbstractPlant):
     def __init__(
         self,
         matrix: ArrayLike,
-        noise: AbstractNoise | ArrayLike,
+        noise: NoiseLike,
         initial_mean: ArrayLike,
-        initial_covariance: AbstractNoise | ArrayLike,
+        initial_covariance: NoiseLike,
         input_matrix: ArrayLike | None = None,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
@@ -252,7 +254,7 @@ def check_turns(
                            f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
 
 
-def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector, Square, AbstractNoise | None]:
+def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
     """Mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]

@@ -73,10 +73,10 @@ class GaussianFilter(AbstractBeliefFilter):
             return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
         observed_of = observed_through(channel.mean_gain, sensor.matrix)
         process = plant.noise_covariance(jnp.asarray(u))
-        result = linear_smoother_step(
+        step = linear_smoother_step(
             after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
         )
-        return replace(result, angles=plant.angles)
+        return replace(step, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
@@ -187,11 +187,11 @@ def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    transform: AbstractTransform,
-    update: AbstractUpdate | None = None,
+    transform: "AbstractTransform",
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
     Args:
@@ -220,10 +220,10 @@ def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Cubature Kalman filter on its channel's second moments.
 
     Args:
@@ -250,10 +250,10 @@ def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
     Args:
