@@ -115,7 +115,8 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
         dt = u[0]
         block = jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         fresh = errors.deviation**2 * -jnp.expm1(-2 * dt / errors.time)  # so that the deviation stays
-        return jax.scipy.linalg.block_diag(numbers.q * jnp.kron(block, np.eye(2)), jnp.diag(fresh))
+        covariance: jax.Array = jax.scipy.linalg.block_diag(numbers.q * jnp.kron(block, np.eye(2)), jnp.diag(fresh))
+        return covariance
 
     states = ["x", "y", "vx", "vy", *(f"error{i}" for i in range(errors.ranges.shape[1]))]
     plant = hg.Plant(
