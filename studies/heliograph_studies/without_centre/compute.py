@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
@@ -64,11 +65,13 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 
 def centre(net: hg.Network, steps: int) -> float:
     """Trace of the error covariance of a filter that receives every measurement, after so many steps."""
-    sensors = [node.sensor for node in net.nodes.values() if isinstance(node, hg.Node)]
-    information = sum(s.matrix.T @ np.linalg.solve(s.noise.covariance, s.matrix) for s in sensors)
+    sensors = [n.sensor for n in net.nodes.values() if isinstance(n, hg.Node) and isinstance(n.sensor, hg.LinearSensor)]
+    rows = [(np.asarray(s.matrix), np.asarray(s.noise.covariance)) for s in sensors]
+    information = sum(h.T @ np.linalg.solve(r, h) for h, r in rows)
     a, p = np.asarray(PLANT.matrix), np.asarray(PLANT.initial_covariance)
+    q = np.asarray(PLANT.noise_covariance(jnp.zeros(0)))
     for _ in range(steps):
-        p = a @ p @ a.T + PLANT.noise.covariance
+        p = a @ p @ a.T + q
         p = np.linalg.inv(np.linalg.inv(p) + information)
     return float(np.trace(p))
 
