@@ -1,9 +1,10 @@
 """A live service with absurd values among good ones, against one that never received them: the same, bit for bit.
 
 Run: python benchmarks/absurd_soak.py [MESSAGES]. One message in a hundred is absurd: sentinels, overflows, inputs that
-no machine can give, in every place that a message has them, in batches of up to BATCH. Prints how many were refused and
+no machine can give, in every place that a message has them, in batches of up to BATCH. A message with an absurd value
+and an absurd input is refused twice, once for each part, and is counted as two parts. Prints how many were refused and
 the time of both, and writes them to benchmarks/absurd_soak.json; ends with an error if a final estimate differs, or
-what is refused of the good messages, and why.
+what is refused of the good messages, and why, or if the absurd parts are not all refused once.
 """
 
 import json
@@ -24,8 +25,12 @@ Sent = dict[str, Any]
 
 
 def stained(good: list[Sent], share: float, rng: np.random.Generator) -> tuple[list[Sent], int]:
-    """The messages with absurd ones in between: of the same node, with inputs or without, or inputs alone."""
+    """The messages with absurd ones in between (of the same node, with inputs or without, or inputs alone), and parts.
+
+    The number is that of absurd values and inputs: of a message that has both, two.
+    """
     results: list[Sent] = []
+    parts = 0
     for item in good:
         if rng.random() < share:
             bad = {k: v for k, v in item.items() if k != "inputs"}
@@ -35,9 +40,10 @@ def stained(good: list[Sent], share: float, rng: np.random.Generator) -> tuple[l
                 bad["inputs"] = [float(rng.choice(VALUES[1:]))]
             elif kind == 2:
                 bad |= {"node": "inputs", "values": [float(rng.choice(VALUES[1:]))]}
+            parts += 1 + (kind == 1)
             results.append(bad)
         results.append(item)
-    return results, len(results) - len(good)
+    return results, int(parts)
 
 
 class Outcome(NamedTuple):
@@ -79,13 +85,16 @@ def main(messages: int) -> None:
     measured: dict[str, Any] = {}
     for name, network, whole in (("steps", worlds.stepping(), True), ("seconds", worlds.moving(), False)):
         good = worlds.messages(PLANTS, messages // PLANTS, SEED, whole)
-        bad, count = stained(good, SHARE, np.random.default_rng(SEED))
+        bad, parts = stained(good, SHARE, np.random.default_rng(SEED))
         clean, with_absurd = outcome(network, good, BATCH), outcome(network, bad, BATCH)
         assert with_absurd.final == clean.final, "final estimates: expected those of a service without absurd messages"
         assert with_absurd.of_good == clean.of_good, "refusals of good messages: expected those without absurd ones"
+        of_absurd = with_absurd.refused.total() - len(with_absurd.of_good)
+        assert of_absurd == parts, f"refusals of absurd values and inputs: expected {parts}, got {of_absurd}"
         measured[name] = {
             "messages": len(good),
-            "absurd": count,
+            "absurd messages": len(bad) - len(good),
+            "absurd values and inputs in them": parts,
             "refused": dict(with_absurd.refused),
             "refused of the good ones": len(clean.of_good),
             "final estimates, all the same": len(clean.final),

@@ -67,7 +67,7 @@ class Running:
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            if line.endswith(b"\n"):  # a line that the kill cut is told again
+            if line.endswith(b"\n"):  # a line that the kill cut is published again
                 self.known.append(json.loads(line))
 
     def write(self, lines: list[bytes]) -> None:

@@ -29,8 +29,8 @@ def node(i):
     sensor = hg.LinearSensor(generator.normal(size=(2, 4)), 0.1)
     laws = hg.Rayleigh(0.8), hg.Rayleigh(0.9)
     relay = hg.amplify_and_forward([hg.hop(law, 0.02, dimension=2) for law in laws])
-    heard = hg.erasure(relay, 0.9) if erased else relay
-    return hg.Node(sensor, heard, {"linear": hg.linear_filter(plant, sensor, relay)})
+    received = hg.erasure(relay, 0.9) if erased else relay
+    return hg.Node(sensor, received, {"linear": hg.linear_filter(plant, sensor, relay)})
 
 def seconds(count, seed):
     start = time.perf_counter()

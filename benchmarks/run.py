@@ -99,7 +99,7 @@ COMPARISONS = {
         Program("cubature_heliograph", "heliograph"),
         (
             Program("cubature_jax", "jax.numpy.linalg, vectorised", target=3),
-            Program("cubature_filterpy", "FilterPy, told the relays' moments", "filterpy"),
+            Program("cubature_filterpy", "FilterPy, given the relays' moments", "filterpy"),
             Program("cubature_filterpy_mean_gain", "FilterPy, mean gain only", "filterpy", target=600, same=False),
         ),
     ),

@@ -29,9 +29,9 @@ class Structure(NamedTuple):
     states: int
     laws: tuple[int, ...]  # of each output's gain
     wiring: str
-    loses: str  # what the receiver is told to be lost: nothing, all outputs at once, each for itself
+    loses: str  # what the receiver knows to be lost: nothing, all outputs at once, each for itself
     dropped: float | None  # how often a dropout delivers, None: anything between
-    arrives: float | None  # the same of the first loss that is told
+    arrives: float | None  # the same of the first loss that is observed
     nodes: int
     own_prior: bool
     remembers: bool
@@ -178,7 +178,7 @@ def hop(law: int, unit: float, values: np.random.Generator) -> Any:
 
 
 def wired(s: Structure, units: np.ndarray, values: np.random.Generator) -> list[Any]:
-    """Channels of one output each: a hop; two with a relay between; with losses that the receiver is not told of."""
+    """Channels of one output each: a hop; two with a relay between; with losses that the receiver does not know of."""
     items = [hop(law, unit, values) for law, unit in zip(s.laws, units, strict=True)]
     if s.wiring == "relays":
         more = [hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), float(variance(values, np.array(u)))) for u in units]
@@ -197,7 +197,7 @@ def joined(s: Structure, items: list[Any]) -> Any:
 
 
 def lossy(s: Structure, items: list[Any], arrivals: list[float]) -> Any:
-    """The channel with the losses that the receiver is told of."""
+    """The channel with the losses that the receiver knows of."""
     if s.loses == "each":
         return joined(s, [hg.erasure(item, chance) for item, chance in zip(items, arrivals, strict=True)])
     return hg.erasure(joined(s, items), arrivals[0]) if s.loses == "whole" else joined(s, items)
@@ -222,8 +222,8 @@ def linear_filters(plant: Any, sensor: Any, channel: Any, s: Structure) -> dict[
 
 
 def informed_filters(plant: Any, sensor: Any, world: Any, modal: bool) -> dict[str, Any]:
-    """The filters that are told what arrived; those with a Gaussian for each mode where asked for."""
-    filters: dict[str, Any] = {"told": hg.filters.side_information_filter(plant, sensor, world)}
+    """The filters that know what arrived; those with a Gaussian for each mode where asked for."""
+    filters: dict[str, Any] = {"informed": hg.filters.side_information_filter(plant, sensor, world)}
     if modal:
         filters["imm"] = hg.filters.imm_filter(plant, sensor, world)
         filters["gpb1"] = hg.filters.gpb1_filter(plant, sensor, world)

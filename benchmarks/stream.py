@@ -1,4 +1,4 @@
-"""Time of one sample through `Stream.push`: the README's filter, which hears one range through a relay.
+"""Time of one sample through `Stream.push`: the README's filter, which receives one range through a relay.
 
 Run: python benchmarks/stream.py. Microseconds of a call, the least and the median of many.
 """

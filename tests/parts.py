@@ -43,6 +43,7 @@ PARTS = {
     "PostgreSQL": Part(lambda: programs() is not None, "apt-get install postgresql"),
     "MQTT": Part(lambda: broker("paho"), LIVE),
     "NATS": Part(lambda: broker("nats"), LIVE),
+    "OPC UA": Part(lambda: find_spec("asyncua") is not None, LIVE.replace("live", "opcua")),
     "browser": Part(lambda: program() is not None, "apt-get install chromium"),
 }
 

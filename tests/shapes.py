@@ -14,8 +14,21 @@ from beartype import beartype
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Have beartype check the annotations of a function that hold a shaped array."""
     hints = function.__annotations__
-    function.__annotations__ = {name: hint for name, hint in hints.items() if _has_shape(hint)}
-    return beartype(function)
+    shaped = {name: _evaluated(hint, function.__globals__) for name, hint in hints.items()}
+    function.__annotations__ = {name: hint for name, hint in shaped.items() if _has_shape(hint)}
+    result: Callable[..., Any] = beartype(function)
+    function.__annotations__ = hints  # as `help` shows them
+    return result
+
+
+def _evaluated(hint: Any, names: dict[str, Any]) -> Any:
+    """Annotation itself, where a short text or a name stands for it."""
+    if isinstance(hint, str):
+        try:
+            return eval(hint, dict(names))
+        except (NameError, TypeError):  # of a class that is defined below, or in quotes inside
+            return None
+    return getattr(hint, "__value__", hint)
 
 
 def _has_shape(hint: Any) -> bool:

@@ -8,7 +8,7 @@ import heliograph as hg
 
 
 def test_three_rooms_with_quantized_links(tmp_path):
-    """Three rooms warm each other and lose heat; the thermometer of each is heard by a small computer that sends its
+    """Three rooms warm each other and lose heat; the thermometer of each is received by a small computer that sends its
     estimate of all three temperatures with few symbols. How warm is the house, and how wrong may that be?"""
     house = hg.LinearPlant(
         0.9 * np.eye(3) + 0.03 * (np.ones((3, 3)) - np.eye(3)),  # of what is above the outside, each minute
@@ -21,9 +21,9 @@ def test_three_rooms_with_quantized_links(tmp_path):
     rooms = {}
     for name, row in zip(house.states, np.eye(3), strict=True):
         thermometer = hg.LinearSensor(row[None], 0.1, outputs=["temperature"])
-        rooms[name] = hg.Node(thermometer, link, {"own": hg.linear_filter(house, thermometer, link)})
+        rooms[name] = hg.Node(thermometer, link, {"local": hg.linear_filter(house, thermometer, link)})
     eight_bits = hg.fusion.UniformQuantizer(levels=255, amplitude=40.0)
-    fused = {"house": hg.Fusion("own", hg.CovarianceIntersection(), eight_bits)}
+    fused = {"house": hg.Fusion("local", hg.CovarianceIntersection(), eight_bits)}
     network = hg.Network(house, rooms, fused)
 
     result = hg.monte_carlo(network, 40, runs=96, key=1, keep=hg.Statistics()).with_units(
@@ -31,7 +31,7 @@ def test_three_rooms_with_quantized_links(tmp_path):
     )
     table = result.to_pandas()
     whole = table.loc["fused", "house"]
-    alone = [table.loc[room, "own"] for room in house.states]
+    alone = [table.loc[room, "local"] for room in house.states]
     assert whole["rmse"] < min(room["rmse"] for room in alone)
     assert whole["claim"] == "upper" and whole["nees high"] < 1.0  # it promises no more than it keeps
     assert all(room["nees low"] < 1.0 < room["nees high"] for room in alone)  # exact

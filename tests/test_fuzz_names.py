@@ -25,7 +25,7 @@ NETWORK = hg.Network(PLANT, {"a": NODE, "b": NODE}, {"all": hg.Fusion("f", fusio
 PATHS = planning.independent_paths([[0.9]], [[0.1]], [[1.0]], [0.1], [1.0], [1.0])
 SAMPLES = {  # what a parameter of this name usually is
     "plant": SCALAR[0], "sensor": SCALAR[1], "channel": HOP, "link": HOP, "network": NETWORK, "horizon": 3,
-    "degree": 1, "filter": KALMAN, "filter_": KALMAN, "filters": [KALMAN], "item": KALMAN, "noise": 0.1,
+    "degree": 1, "filter": KALMAN, "filters": [KALMAN], "item": KALMAN, "noise": 0.1,
     "law": hg.Rayleigh(1.0), "matrix": EYE, "transition": 0.9 * EYE, "process": 0.1 * EYE, "covariance": EYE,
     "mean": [0.0, 0.0], "claim": "exact", "initial_mean": [0.0, 0.0], "initial_covariance": EYE,
     "sensors": {"a": SENSOR}, "rows": [[1.0, 0.0]], "noises": [0.1], "measurements": np.zeros((3, 1)),

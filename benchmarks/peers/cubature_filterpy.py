@@ -1,4 +1,4 @@
-"""FilterPy's cubature filter, made to compute what ours does: told the relays' moments, its points drawn anew.
+"""FilterPy's cubature filter, made to compute what ours does: given the relays' moments, its points drawn anew.
 
 FilterPy has no channel. Its user can put the mean gain into hx, give each update the covariance that the random gain
 adds, and draw the points of the measurement from the prediction as ours does (FilterPy's own update reuses the moved

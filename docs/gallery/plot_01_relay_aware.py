@@ -2,7 +2,7 @@
 A relay that fades, and the filter that knows it
 ================================================
 
-A quantity that drifts (a temperature, a position) is measured every step. Its sensor is heard through
+A quantity that drifts (a temperature, a position) is measured every step. Its sensor is received through
 a relay: the first hop fades as radio does indoors (Rayleigh), the second amplifies, and both add noise.
 The receiver knows how the gain is *distributed*, but not what it was at any step.
 

@@ -3,8 +3,8 @@ Skewed noise: a filter that uses squares
 ========================================
 
 The Kalman filter is the best *linear* filter whatever the noise. If the noise is skewed (many small
-values on one side, few large ones on the other), a filter that also hears the square of each
-measurement knows more. How much more can be told from the model, before there is any data.
+values on one side, few large ones on the other), a filter that also receives the square of each
+measurement knows more. How much more follows from the model, before there is any data.
 """
 
 import matplotlib.pyplot as plt

@@ -17,12 +17,12 @@ link = hg.hop(hg.Discrete([0.6, 1.0], [0.5, 0.5]), noise=0.02)
 nodes = {}
 for name, row in {"kitchen": [1.0, 0.2], "hall": [0.2, 1.0]}.items():
     sensor = hg.LinearSensor([row], noise=0.05)
-    nodes[name] = hg.Node(sensor, link, {"own": hg.linear_filter(rooms, sensor, link)})
+    nodes[name] = hg.Node(sensor, link, {"local": hg.linear_filter(rooms, sensor, link)})
 
 counts = [7, 15, 31, 63, 127]
 rule = hg.fusion.EqualIntersection()
-fused = {f"{levels}": hg.Fusion("own", rule, hg.fusion.UniformQuantizer(levels, amplitude=4.0)) for levels in counts}
-fused["not quantized"] = hg.Fusion("own", rule)
+fused = {f"{levels}": hg.Fusion("local", rule, hg.fusion.UniformQuantizer(levels, amplitude=4.0)) for levels in counts}
+fused["not quantized"] = hg.Fusion("local", rule)
 network = hg.Network(rooms, nodes, fused)
 result = hg.monte_carlo(network, horizon=25, runs=512, key=0, keep=hg.Statistics())["fused"]
 

@@ -20,7 +20,7 @@ link = hg.hop(1.0, 0.05, delay=hg.Discrete([0, 1, 2], chances))
 
 cases = {
     "taken as current": (hg.filters.as_current_filter(plant, sensor, link), link),
-    "delays not told": (hg.linear_filter(plant, sensor, link), link),
+    "delays not known": (hg.linear_filter(plant, sensor, link), link),
 }
 fig, ax = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
 for color, (name, (item, channel)) in enumerate(cases.items()):

@@ -3,7 +3,7 @@ Events out of order, and twice
 ==============================
 
 A ``Timeline`` takes events as a network delivers them. Each gets a verdict; one that is late is put in its
-place in time, and what came after is computed again. So the estimates are those of a filter that had heard
+place in time, and what came after is computed again. So the estimates are those of a filter that had received
 everything in order.
 """
 

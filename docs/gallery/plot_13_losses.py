@@ -20,7 +20,7 @@ arrivals = np.linspace(0.25, 1.0, 16)
 bounds = []
 for arrival in arrivals:
     received = hg.erasure(hg.perfect(), arrival)
-    node = hg.Node(sensor, received, {"told": hg.kalman_filter(plant, sensor)})
+    node = hg.Node(sensor, received, {"knows losses": hg.kalman_filter(plant, sensor)})
     result = hg.simulation.certify_boundedness(hg.Network(plant, {"node": node}))
     bounds.append(np.trace(result.bound) if result.verdict == "certified" else np.nan)
 

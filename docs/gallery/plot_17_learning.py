@@ -16,7 +16,7 @@ TRUTH = {"plant noise": 0.15, "fading": 0.7, "hop noise": 0.3}
 
 
 def network(numbers):
-    """A cart that is pushed to and fro, and whose position is heard over a Rayleigh link."""
+    """A cart that is pushed to and fro, and whose position is received over a Rayleigh link."""
     plant = hg.LinearPlant([[0.95]], numbers["plant noise"], [0.0], 1.0, [[1.0]], states=["position"])
     sensor = hg.LinearSensor([[1.0]], 0.1)
     link = hg.hop(hg.Rayleigh(numbers["fading"]), numbers["hop noise"])
@@ -42,7 +42,7 @@ fits = {n: hg.fit(unknown, received[:n], pushes[:n], starts=1) for n in (400, st
 print(fits[steps])
 
 # %%
-# What is that worth? On data that no fit has seen, three filters hear the same: one with the first guesses, one with
+# What is that worth? On data that no fit has seen, three filters receive the same: one with the first guesses, one with
 # the learned numbers, one with the true ones. NEES is the squared error over what the filter claims: 1 if that is true.
 
 world = network(TRUTH)

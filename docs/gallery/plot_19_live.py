@@ -5,7 +5,7 @@ A service, and messages that come late
 ``heliograph serve`` keeps filters running: messages go in, estimates come out. Inside it is a ``Service``, which knows
 no pipe and no broker, and can be fed from Python. Here a recording is replayed through a radio link that delays,
 loses and doubles messages. After each message the service tells what is known now, which is provisional: what
-comes late may still change it. What is older than the window is final, and told once.
+comes late may still change it. What is older than the window is final, and published once.
 """
 
 import json
@@ -38,7 +38,7 @@ for arrival, message in lines(received, plant="", origin=origin):
 known += [(received[-1].arrival, json.loads(output.body)) for output in service.finish(ended=True)]
 
 
-first = {}  # what was told of a step while it was the newest
+first = {}  # what was published of a step while it was the newest
 final = {}
 for _, message in known:
     if message["kind"] != "refused":
@@ -47,7 +47,10 @@ for _, message in known:
         (first if message["kind"] == "provisional" else final).setdefault(message["time"], estimate)
 
 fig, (top, bottom) = plt.subplots(2, 1, figsize=(9, 5.2), sharex=True, height_ratios=[3, 2], layout="constrained")
-for name, result, color, shift in (("provisional, as first told", first, "C1", -0.15), ("final", final, "C0", 0.15)):
+for name, result, color, shift in (
+    ("provisional, at first", first, "C1", -0.15),
+    ("final", final, "C0", 0.15),
+):
     times = np.array(list(result))
     mean, deviation = np.transpose(list(result.values()))
     error = mean - truth[times.astype(int)]
@@ -70,7 +73,7 @@ bottom.legend(fontsize=8, ncols=3, loc="upper center")
 
 # %%
 # Both kinds are honest. A provisional estimate knows less, and says so: its bar is longer. The final one is that of a
-# filter that has heard everything that came within the window, in the order of time. A copy changes nothing, and what
-# comes later than the window is refused. Each of them is told, with the reason.
+# filter that received all that came within the window, in the order of time. A copy changes nothing, and what
+# comes later than the window is refused. Each of them is published, with the reason.
 
 print(json.dumps(next(item for _, item in known if item.get("reason") == "late"), indent=1))

@@ -112,7 +112,7 @@ def differences(setting: object, published: object) -> dict[str, tuple[str, str]
 
 
 def digest(setting: object) -> str | None:
-    """A word that two settings share only if they are alike; None where that cannot be told of a function in it."""
+    """A word that two settings share only if they are alike; None where that cannot be said of a function in it."""
     try:
         parts = [name.encode() + b"=" + _bytes(value) for name, value in leaves(setting)]
     except (pickle.PicklingError, AttributeError, TypeError):

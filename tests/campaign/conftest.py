@@ -15,7 +15,7 @@ def forget_compiled_programs():
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     """The results of a campaign that ran undisturbed in one process."""
-    from heliograph.campaign.run import run_campaign  # not before tests/conftest.py has told JAX how to compile
+    from heliograph.campaign.run import run_campaign  # not before tests/conftest.py has set how JAX compiles
     from tests.campaign.example import CHUNKS, write
 
     folder = tmp_path_factory.mktemp("undisturbed")

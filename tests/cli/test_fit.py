@@ -81,7 +81,7 @@ def test_the_page_says_what_was_learned(folder, fits):
         assert (folder / "out" / f"{name}.png").stat().st_size > 5000
 
 
-def test_the_losses_of_the_recording_are_told(folder):
+def test_the_losses_of_the_recording_are_informed(folder):
     """A tenth of the rows was lost, independently: the interval holds that, and the test finds no memory."""
     (losses,) = json.loads((folder / "out" / "summary.json").read_text())["losses"].values()
     share = losses["laws"]["independent"]["loss"]
@@ -100,7 +100,7 @@ def test_other_numbers_are_refused(folder, tmp_path):
         load_fitted(folder / "cart.py", other)
 
 
-def test_a_network_in_which_nothing_is_free_is_told(folder, tmp_path, capsys):
+def test_a_network_in_which_nothing_is_free_is_informed(folder, tmp_path, capsys):
     path = tmp_path / "still.py"
     path.write_text(SOURCE.format(plant=1.0, hop=1.0).replace("hg.free(1.0, ", "(lambda x, y: x)(1.0, "))
     out = str(tmp_path / "out")

@@ -75,7 +75,7 @@ def alone(side: float, name: str) -> hg.Network:
 
 
 def recording() -> dict[str, np.ndarray]:
-    """What two nodes heard of a robot in the east, in NumPy."""
+    """What two nodes received of a robot in the east, in NumPy."""
     rng = np.random.default_rng(5)
     x, received = np.array([30.5, -12.5, np.pi / 2 + 0.03]), []
     for distance, turn in U:
@@ -154,7 +154,7 @@ def test_filters_are_consistent_across_the_cut_as_elsewhere(side):
 
 
 def turning(angles: bool) -> tuple[hg.LinearPlant, hg.LinearSensor]:
-    """A heading and its rate, heard by a compass."""
+    """A heading and its rate, received by a compass."""
     names, item = ["heading", "rate"], ["heading"] if angles else []
     start = ([3.0, 0.3], np.diag([0.2, 0.01]))
     plant = hg.LinearPlant([[1.0, 1.0], [0.0, 1.0]], np.diag([1e-3, 1e-4]), *start, states=names, circular=item)
@@ -171,7 +171,7 @@ MAKERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
-    """Five turns: what is heard without its turns gives what is heard with them, likelihoods too."""
+    """Five turns: what is received without its turns gives what is received with them, likelihoods too."""
     rng = np.random.default_rng(7)
     wound = np.cumsum(np.full(100, 0.3)) + 3.0 + rng.normal(0, 0.2, 100)
     wound[40:43] = np.nan
@@ -214,7 +214,7 @@ def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
 REFUSED = {
     "linear": lambda p, s: hg.linear_filter(p, s, hg.perfect()),
     "polynomial": lambda p, s: hg.polynomial_filter(p, s, hg.perfect(), 2, 5),
-    "told": lambda p, s: hg.filters.side_information_filter(p, s, hg.perfect()),
+    "informed": lambda p, s: hg.filters.side_information_filter(p, s, hg.perfect()),
     "mode known": lambda p, s: hg.filters.mode_known_filter(p, s, hg.perfect()),
     "boundedness": lambda p, s: hg.simulation.certify_boundedness(
         hg.Network(p, {"a": hg.Node(s, hg.erasure(hg.perfect(), 0.5), {"f": hg.kalman_filter(p, s)})})
@@ -257,7 +257,7 @@ def test_a_plant_says_how_states_differ():
 
 @pytest.mark.slow
 def test_simulated_errors_are_around_the_circle():
-    """Truth and signals are told between -pi and pi, and x - xhat is the error, whoever subtracts."""
+    """Truth and signals are given between -pi and pi, and x - xhat is the error, whoever subtracts."""
     plant, sensor = turning(True)
     channel = hg.parallel([hg.hop(1.0, 0.5)])
     local = {"f": hg.extended_filter(plant, sensor, channel)}

@@ -1,4 +1,4 @@
-"""Filters that are told the mode: modes of any kinds, flags of the right step, and what is refused."""
+"""Filters that know the mode: modes of any kinds, flags of the right step, and what is refused."""
 
 import numpy as np
 import pytest

@@ -45,7 +45,7 @@ def of_problems(count):
 
 @of_problems(6)
 def test_equal_rows_are_no_memory(seed, plant, sensor, maps, rows, law):
-    """Against the mixture of the maps, which the filter of links that forget hears."""
+    """Against the mixture of the maps, which the filter of links that forget receives."""
     chain = hg.random_affine.MarkovChain([law] * 3)
     forgets = hg.random_affine.Mixture(maps, law)
     result = variances(plant, sensor, Modes(chain, maps), 30)

@@ -114,18 +114,20 @@ def test_a_prediction_over_an_absurd_time_is_no_number():
 
 
 def test_in_single_precision_too():
-    """Where eps d is 0.1 at the bound: a thousand deviations are used, and the largest numbers are refused."""
+    """The bound is eps^-1/2 = 2,900 deviations, where eps d^2 is all of a variance; squares of sentinels overflow."""
+    most = 2.0**23
     for name in ("linear", "extended", "imm"):
         item = FILTERS[name]
         with jax.enable_x64(False):
             state = jax.tree.map(lambda x: jax.numpy.asarray(x, jax.numpy.asarray(x).dtype), item.init())
             state = jax.tree.map(lambda x: x.astype("float32") if x.dtype == "float64" else x, state)
             judged = jax.jit(lambda z, u: item.step_judged(state, z, u, 0)[2])  # noqa: B023
-            for z, u, reason, wrong in ((1e3, 0.0, 0, 0), (1e20, 0.0, Reason.FAR, 0), (0.5, 1e20, 0, 1)):
-                said = judged(np.float32([z]), np.float32([u]))
-                assert said.reason.dtype == np.float32
-                assert (said.input == 1) == bool(wrong)
-                assert wrong or said.reason == reason
+            values = np.float32([1e2, 1e3, 1e5, 1e6, 1e20, 3e38])
+            said = [judged(np.float32([z]), np.float32([0.0])) for z in values]
+            assert {item.reason.dtype for item in said} == {np.dtype(np.float32)}
+            far = [bool(item.reason == Reason.FAR) for item in said]
+            assert far == [not item.distance <= most for item in said] == [False, False, True, True, True, True]
+            assert judged(np.float32([0.5]), np.float32([1e20])).input == 1
 
 
 def test_a_filter_that_is_lost_does_not_refuse_for_the_others():

@@ -14,18 +14,18 @@ def two_gains(mean, variance):
 
 
 def network(plant, parts, fused, order=None):
-    """Nodes (C, R, mean gain, its variance, N) with the best linear filter "own" each."""
+    """Nodes (C, R, mean gain, its variance, N) with the best linear filter "local" each."""
     nodes = {}
     for i in range(len(parts)) if order is None else order:
         c, r, mean, variance, noise = parts[i]
         sensor = hg.LinearSensor(c, r * np.eye(len(c)))
         channel = hg.hop(two_gains(mean, variance), noise=noise * np.eye(len(c)))
-        nodes[f"node {i}"] = hg.Node(sensor, channel, {"own": hg.linear_filter(plant, sensor, channel)})
+        nodes[f"node {i}"] = hg.Node(sensor, channel, {"local": hg.linear_filter(plant, sensor, channel)})
     return hg.Network(plant, nodes, fused)
 
 
 def rules():
-    """Every informed rule, of the filter "own"."""
+    """Every informed rule, of the filter "local"."""
     f = hg.fusion
     results = {
         "matrix": f.MatrixWeights(),
@@ -34,7 +34,7 @@ def rules():
         "scalar": f.ScalarWeights(),
         "all_reports": f.AllReports(),
     }
-    return {name: hg.Fusion("own", rule) for name, rule in results.items()}
+    return {name: hg.Fusion("local", rule) for name, rule in results.items()}
 
 
 def case(name):
@@ -52,7 +52,7 @@ def case(name):
 
 
 def random_case(seed, nodes=3, n=3):
-    """A random plant with a mean, and nodes that hear one or two numbers; some hear the same."""
+    """A random plant with a mean, and nodes that receive one or two numbers; some receive the same."""
     draw = np.random.default_rng(seed)
     matrix = draw.normal(size=(n, n)) / np.sqrt(n)
     root = draw.normal(size=(n, n))

@@ -27,9 +27,9 @@ def test_a_value_is_sent_when_it_has_changed_by_more_than_the_threshold(known):
 
 def test_silence_taken_for_a_loss_needs_a_rule_that_hears_reports():
     plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
-    nodes = {"a": hg.Node(sensor, hg.perfect(), {"own": hg.kalman_filter(plant, sensor)})}
+    nodes = {"a": hg.Node(sensor, hg.perfect(), {"local": hg.kalman_filter(plant, sensor)})}
     sends = hg.fusion.EventSending(0.1, announced=False)
     with pytest.raises(ValueError, match="a rule that uses reports"):
-        hg.Network(plant, nodes, {"one": hg.Fusion("own", hg.fusion.EqualIntersection(), quantizer=sends)})
+        hg.Network(plant, nodes, {"one": hg.Fusion("local", hg.fusion.EqualIntersection(), quantizer=sends)})
     with pytest.raises(ValueError, match="threshold: expected positive numbers"):
         hg.fusion.EventSending(0.0)

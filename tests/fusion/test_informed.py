@@ -53,14 +53,14 @@ def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""
     plant, parts = random_case(seed)
     n = len(plant.states)
-    cross = hg.simulation.cross_covariances(network(plant, parts, {}), "own", 12)
+    cross = hg.simulation.cross_covariances(network(plant, parts, {}), "local", 12)
     joint, _ = brute_force(plant, parts, 12)
     np.testing.assert_allclose(cross.joint.reshape(joint[n:, n:].shape), joint[n:, n:], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(cross.of_state.reshape(-1, n), joint[n:, :n], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(cross.state_covariance, joint[:n, :n], rtol=1e-12)
     np.testing.assert_allclose(cross.bias, 0.0, atol=1e-14)
     order = [2, 1, 0]
-    turned = hg.simulation.cross_covariances(network(plant, parts, {}, order), "own", 12)
+    turned = hg.simulation.cross_covariances(network(plant, parts, {}, order), "local", 12)
     assert turned.nodes == tuple(f"node {i}" for i in order)
     np.testing.assert_allclose(turned.joint, cross.joint[order][:, :, order], rtol=1e-12, atol=1e-14)
     weights, covariance = cross.matrix_weights()
@@ -117,7 +117,7 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
 def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
     groups = {"a": [0, 3], "b": [1, 2, 4]}
-    leaves = hg.simulation.cross_covariances(world, "own", 6)
+    leaves = hg.simulation.cross_covariances(world, "local", 6)
     level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
     by_hand = np.zeros((2, 3, 5, 3))
     for r, mine in enumerate(groups.values()):
@@ -127,7 +127,7 @@ def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     weights, covariance = level.matrix_weights()
     flat = leaves.matrix_weights()[1]
     assert np.trace(flat) <= np.trace(covariance) <= min(np.trace(joint[r, :, r]) for r in (0, 1))
-    errors = np.stack([record.errors(node, "own")[:, -1] for node in world.names], axis=1)
+    errors = np.stack([record.errors(node, "local")[:, -1] for node in world.names], axis=1)
     square = np.sum(np.einsum("ars,rsib,kib->ka", weights, by_hand, errors) ** 2, axis=-1)
     assert abs(square.mean() - np.trace(covariance)) < 3 * square.std() / np.sqrt(len(square))
     with pytest.raises(ValueError, match=r"nodes: expected one relay for each, got several for \['node 1'\]"):
@@ -139,12 +139,12 @@ def along_and_linear(plant, parts):
     linear, fused = network(plant, parts, {}), {"alone": hg.Fusion("alone", hg.fusion.MatrixWeights(with_mean=True))}
     nodes = {}
     for name, node in linear.nodes.items():
-        filters = {"own": node.filters["own"], "cubature": hg.cubature_filter(plant, node.sensor, node.channel)}
+        filters = {"local": node.filters["local"], "cubature": hg.cubature_filter(plant, node.sensor, node.channel)}
         nodes[name] = hg.Node(node.sensor, node.channel, filters)
     first = nodes["node 0"]
-    nodes["node 0"] = hg.Node(first.sensor, first.channel, first.filters | {"alone": first.filters["own"]})
+    nodes["node 0"] = hg.Node(first.sensor, first.channel, first.filters | {"alone": first.filters["local"]})
     for name in ("matrix", "all_reports"):
-        fused |= {f"{item} {name}": hg.Fusion(item, rules()[name].rule) for item in ("own", "cubature")}
+        fused |= {f"{item} {name}": hg.Fusion(item, rules()[name].rule) for item in ("local", "cubature")}
     return hg.Network(plant, nodes, fused)
 
 
@@ -201,9 +201,9 @@ def test_what_is_not_known_is_refused(make, message):
     channel = hg.hop(fading, noise=0.1)
     if "forgets" in message:
         channel = hg.gilbert_elliott(channel, hg.model.silent(noise=0.1), 0.1, 0.5)
-    nodes = {"a": hg.Node(sensor, channel, {"own": make(plant, sensor, channel)})}
+    nodes = {"a": hg.Node(sensor, channel, {"local": make(plant, sensor, channel)})}
     with pytest.raises(ValueError, match=message):
-        hg.Network(plant, nodes, {"matrix": hg.Fusion("own", hg.fusion.MatrixWeights())})
+        hg.Network(plant, nodes, {"matrix": hg.Fusion("local", hg.fusion.MatrixWeights())})
 
 
 def test_a_covariance_each_is_not_enough():
@@ -243,19 +243,19 @@ def test_a_large_tree_is_the_small_one():
 
     def leaf(item):
         sensor, channel = hg.LinearSensor(item["output"], 0.2), hg.hop(two_gains(0.8, 0.05), noise=item["noise"])
-        return hg.Node(sensor, channel, {"own": hg.linear_filter(plant, sensor, channel)})
+        return hg.Node(sensor, channel, {"local": hg.linear_filter(plant, sensor, channel)})
 
     tree = hg.simulation.relay_tree(plant, leaf, numbers, 3, 5)
     nodes = {f"{i}": leaf({name: values[i] for name, values in numbers.items()}) for i in range(11)}
     net = hg.Network(plant, nodes)
-    level = hg.simulation.cross_covariances(net, "own", 5)
+    level = hg.simulation.cross_covariances(net, "local", 5)
     for covariances in tree.covariances:
         np.testing.assert_allclose(covariances, np.einsum("iaib->iab", level.joint), rtol=1e-7)
         names = level.nodes
         level = level.fused({f"over {i}": names[i : i + 3] for i in range(0, len(names), 3)})
     assert [len(c) for c in tree.covariances] == [11, 4, 2, 1] and tree.claim == "exact"
     record = hg.monte_carlo(net, 5, 2016, 3)
-    estimates = np.stack([record.estimates[name]["own"].mean[:, -1] for name in net.names], axis=1)
+    estimates = np.stack([record.estimates[name]["local"].mean[:, -1] for name in net.names], axis=1)
     square = np.sum((record.truth[:, -1] - tree.fused(estimates)) ** 2, axis=-1)
     assert abs(square.mean() - np.trace(tree.root)) < 3 * square.std() / np.sqrt(len(square))
     with pytest.raises(ValueError, match="one leading axis of nodes"):

@@ -1,4 +1,4 @@
-"""Losses that are told: a claim for each pattern of losses, every pattern of a small case enumerated."""
+"""Observed losses: a claim for each pattern of losses, every pattern of a small case enumerated."""
 
 from itertools import product
 
@@ -51,7 +51,7 @@ def net():
     rules = {"matrix": hg.fusion.MatrixWeights(), "all_reports": hg.fusion.AllReports()}
     perfect = network(PLANT, PARTS, {})
     nodes = {n: hg.Node(v.sensor, hg.erasure(v.channel, 0.6), v.filters) for n, v in perfect.nodes.items()}
-    return hg.Network(PLANT, nodes, {name: hg.Fusion("own", rule) for name, rule in rules.items()})
+    return hg.Network(PLANT, nodes, {name: hg.Fusion("local", rule) for name, rule in rules.items()})
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ def check_no_number(quantizer):
 
 
 def sent_over(quantizer, values, arrives, restart=lambda k: False):
-    """What a receiver delivers that is told nothing of what did not arrive, and the states of both ends."""
+    """What a receiver delivers that knows nothing of what did not arrive, and the states of both ends."""
     here, there = quantizer.init(1), quantizer.init(1)
     for k, x in enumerate(values):
         symbols = quantizer.encode(here, [x], restart=restart(k))

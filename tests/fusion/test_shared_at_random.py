@@ -19,7 +19,7 @@ TURNED, SAME = [1, 0, 2], np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0]])
 
 
 def drawn(seed, growth):
-    """Plant, sensor noise, shared hop and own hops; node 3 hears what node 2 hears, bit for bit."""
+    """Plant, sensor noise, shared hop and own hops; node 3 receives what node 2 receives, bit for bit."""
     draw = np.random.default_rng(seed)
     matrix = draw.normal(size=(2, 2))
     matrix *= growth / np.abs(np.linalg.eigvals(matrix)).max()
@@ -34,7 +34,7 @@ def drawn(seed, growth):
 
 
 def network(d, rules, order=(0, 1, 2)):
-    """Two sensors with correlated noise, one hop for both, a hop to each node, of which the second is heard twice.
+    """Two sensors with correlated noise, one hop for both, a hop to each node, of which the second is received twice.
 
     The first node's filter trusts the mean gain and starts where it likes: its gains are not the best.
     """
@@ -50,8 +50,8 @@ def network(d, rules, order=(0, 1, 2)):
         sensor = hg.LinearSensor(d["outputs"][[i]], d["r"][i, i])
         alone = hg.amplify_and_forward([hg.hop(shared, noise=0.05), hops[i]])
         wrong = hg.mean_gain_filter(plant, sensor, alone, initial_mean=d["guess"])
-        filters[f"node {node}"] = {"own": wrong if i == 0 else hg.linear_filter(plant, sensor, alone)}
-    fused = {name: hg.Fusion("own", rule) for name, rule in rules.items()}
+        filters[f"node {node}"] = {"local": wrong if i == 0 else hg.linear_filter(plant, sensor, alone)}
+    fused = {name: hg.Fusion("local", rule) for name, rule in rules.items()}
     return hg.Network.sharing(plant, hg.LinearSensor(d["outputs"], d["r"]), channel, filters, fused)
 
 
@@ -90,14 +90,14 @@ def test_what_holds_for_every_network(seed, growth):
 
 
 def check_what_holds(d, net):
-    cross = hg.simulation.cross_covariances(net, "own", STEPS)
+    cross = hg.simulation.cross_covariances(net, "local", STEPS)
     joint = cross.joint + np.einsum("ia,jb->iajb", cross.bias, cross.bias)
-    plans = [net.nodes[f"node {i}"].filters["own"].planned(np.zeros((STEPS, 0))) for i in range(2)]
+    plans = [net.nodes[f"node {i}"].filters["local"].planned(np.zeros((STEPS, 0))) for i in range(2)]
     expected = by_hand(d, [np.asarray(p.steps.values.gain)[:, :, 0] for p in plans])
     size = np.abs(joint).max()
     np.testing.assert_allclose(joint[:2, :, :2].transpose(0, 2, 1, 3), expected, rtol=1e-8, atol=1e-10 * size)
     np.testing.assert_allclose(joint[2], joint[1], rtol=1e-12, atol=1e-12 * size)  # a copy
-    turned = hg.simulation.cross_covariances(network(d, {}, TURNED), "own", STEPS)
+    turned = hg.simulation.cross_covariances(network(d, {}, TURNED), "local", STEPS)
     np.testing.assert_allclose(turned.joint, cross.joint[TURNED][:, :, TURNED], rtol=1e-9, atol=1e-11 * size)
     fused = hg.simulation.fused_covariances(net, STEPS)
     matrix, with_mean, everything = (float(np.trace(fused[name][-1])) for name in RULES)

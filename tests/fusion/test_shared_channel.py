@@ -27,7 +27,7 @@ def shared_network(fused):
     for i, hop in enumerate(hops):
         sensor = hg.LinearSensor(np.eye(2)[[i]], R[i, i])
         alone = hg.amplify_and_forward([hg.hop(two_gains(*FIRST), noise=HOP_NOISE), hop])
-        filters[f"node {i}"] = {"own": hg.linear_filter(plant, sensor, alone)}
+        filters[f"node {i}"] = {"local": hg.linear_filter(plant, sensor, alone)}
     return hg.Network.sharing(plant, hg.LinearSensor(np.eye(2), R), channel, filters, fused)
 
 
@@ -61,10 +61,10 @@ def by_hand(steps):
 
 
 def test_cross_covariances_of_what_is_shared():
-    cross = hg.simulation.cross_covariances(shared_network({}), "own", 15)
+    cross = hg.simulation.cross_covariances(shared_network({}), "local", 15)
     np.testing.assert_allclose(cross.joint, by_hand(15), rtol=1e-9, atol=1e-12)
     _, covariance = cross.matrix_weights()
-    net = shared_network({"matrix": hg.Fusion("own", hg.fusion.MatrixWeights())})
+    net = shared_network({"matrix": hg.Fusion("local", hg.fusion.MatrixWeights())})
     np.testing.assert_allclose(hg.simulation.fused_covariances(net, 15)["matrix"][-1], covariance, rtol=1e-9)
 
 
@@ -72,9 +72,9 @@ def test_cross_covariances_of_what_is_shared():
 def test_monte_carlo_agrees():
     """The claims within three standard errors; as if nothing but the plant were shared they would be off by more."""
     rules = {"matrix": hg.fusion.MatrixWeights(), "all": hg.fusion.AllReports()}
-    net = shared_network({name: hg.Fusion("own", rule) for name, rule in rules.items()})
+    net = shared_network({name: hg.Fusion("local", rule) for name, rule in rules.items()})
     record = hg.monte_carlo(net, 8, 8000, 0)
-    errors = np.stack([record.errors(f"node {i}", "own")[:, -1] for i in range(2)], axis=1)
+    errors = np.stack([record.errors(f"node {i}", "local")[:, -1] for i in range(2)], axis=1)
     product = np.einsum("ka,kb->kab", errors[:, 0], errors[:, 1])
     off = np.abs(product.mean(axis=0) - by_hand(8)[0, :, 1]) / (product.std(axis=0) / np.sqrt(len(product)))
     assert np.all(off < 3)
@@ -87,5 +87,5 @@ def test_monte_carlo_agrees():
 def test_all_outputs_are_heard_once():
     net = shared_network({})
     filters = {"alone": net.nodes["node 0"].filters}
-    with pytest.raises(ValueError, match="to hear its 2 outputs, each once"):
+    with pytest.raises(ValueError, match="to receive its 2 outputs, each once"):
         hg.Network.sharing(net.plant, net.common.sensor, net.common.channel, filters)

@@ -22,8 +22,8 @@ def net():
         "second": hg.fusion.ReportLink(every=2),
     }
     quantizer = hg.fusion.UniformQuantizer(60, 30.0)
-    fused = {name: hg.Fusion("own", hg.fusion.AllReports(), uplink=link) for name, link in links.items()}
-    fused["quantized"] = hg.Fusion("own", hg.fusion.AllReports(), quantizer=quantizer)
+    fused = {name: hg.Fusion("local", hg.fusion.AllReports(), uplink=link) for name, link in links.items()}
+    fused["quantized"] = hg.Fusion("local", hg.fusion.AllReports(), quantizer=quantizer)
     return network(PLANT, PARTS, fused)
 
 
@@ -130,10 +130,10 @@ def test_runs_and_streams_give_what_was_simulated(net, record):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda f, n: hg.Fusion("own", f.MatrixWeights(), uplink=f.ReportLink(every=2)), "a rule that uses reports"),
-        (lambda f, n: hg.Fusion("own", f.AllReports(), uplink=f.ReportLink(hg.hop(1.0, 0.1))), "that takes 2 numbers"),
-        (lambda f, n: hg.Fusion("own", f.AllReports(), uplink={"node 0": f.ReportLink()}), "one for each node of"),
-        (lambda f, n: hg.Fusion("own", f.AllReports(), quantizer=f.EscapeQuantizer(9, 1.0, 0.9, 0.1, 0.1)),
+        (lambda f, n: hg.Fusion("local", f.MatrixWeights(), uplink=f.ReportLink(every=2)), "a rule that uses reports"),
+        (lambda f, n: hg.Fusion("local", f.AllReports(), uplink=f.ReportLink(hg.hop(1.0, 0.1))), "takes 2 numbers"),
+        (lambda f, n: hg.Fusion("local", f.AllReports(), uplink={"node 0": f.ReportLink()}), "one for each node of"),
+        (lambda f, n: hg.Fusion("local", f.AllReports(), quantizer=f.EscapeQuantizer(9, 1.0, 0.9, 0.1, 0.1)),
          "bounded before any data"),
     ],
 )  # fmt: skip
@@ -145,6 +145,6 @@ def test_what_is_not_known_is_refused(make, message):
 def test_a_centre_that_cannot_know_what_a_node_lost_is_refused():
     perfect = network(PLANT, PARTS, {})
     nodes = {n: hg.Node(v.sensor, hg.erasure(v.channel, 0.5), v.filters) for n, v in perfect.nodes.items()}
-    fused = {"one": hg.Fusion("own", hg.fusion.AllReports(), uplink=hg.fusion.ReportLink(delay=1))}
+    fused = {"one": hg.Fusion("local", hg.fusion.AllReports(), uplink=hg.fusion.ReportLink(delay=1))}
     with pytest.raises(ValueError, match="nodes that lose no measurements"):
         hg.Network(PLANT, nodes, fused)

@@ -70,7 +70,7 @@ def parameters(*domains):
 
 
 def informed(known, parameters, points):
-    """Ranks of the information of what is told, functions of the values, at points of the line."""
+    """Ranks of the information of what is identified, functions of the values, at points of the line."""
     ranks = []
     for x in points:
         values, turned = parameters.entries_at(x), parameters.jacobian(x)

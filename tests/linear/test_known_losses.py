@@ -1,4 +1,4 @@
-"""Bounds and certificates under losses that are told, against published examples, brute force and Monte Carlo."""
+"""Bounds and certificates under observed losses, against published examples, brute force and Monte Carlo."""
 
 import numpy as np
 import pytest
@@ -127,7 +127,7 @@ def test_the_radius_is_the_growth_of_the_mean_square_under_the_gains():
 
 
 def test_modes_that_tell_the_same_share_their_gain():
-    """Two modes that both deliver: what is hidden cannot choose the gain, and the bound holds for what is told."""
+    """Two modes that both deliver: what is hidden cannot choose the gain, and the bound holds for what is observed."""
     a, c, q, r = (np.asarray(item) for item in SCALAR)
     chain = np.array([[0.6, 0.2, 0.2], [0.1, 0.2, 0.7], [0.3, 0.3, 0.4]])
     law = long_run_law(np.ones(3) / 3, chain)

@@ -1,4 +1,4 @@
-"""States that move and are heard in one shadow: a relay that filters, and a plant that changes with the mode."""
+"""States that move, received behind shared fading: a relay that filters, and a plant that changes with the mode."""
 
 from itertools import pairwise, product
 
@@ -18,7 +18,7 @@ A, Q, C, R, K = 0.9, 0.3, 1.0, 0.1, 0.4
 
 
 def relay(link):
-    """(x, s) -> (x+, s+): x+ = A x + w, s+ = (A - K A) s + K z, where the relay hears z of x+ through `link`."""
+    """(x, s) -> (x+, s+): x+ = A x + w, s+ = (A - K A) s + K z, where the relay receives z of x+ through `link`."""
     plant = GainAndNoise(Constant(1.0), np.diag([A, 1.0]), np.diag([Q, 0.0]))
     observed = Series([GainAndNoise(Constant(1.0), [[C, 0.0]], R), link])
     use = known([[1.0, 0.0, 0.0], [0.0, A - K * A, K]])
@@ -31,7 +31,7 @@ def received(link):
 
 
 def step(second, size, move, receive):
-    """E[r r'] of r = (y, 1, z_1, ..., z_k) moved and heard once: what is known of a map is its mean and spread."""
+    """E[r r'] of r = (y, 1, z_1, ..., z_k) moved and received once: what is known of a map is its mean and spread."""
     for channel, replace in ((move, True), (receive, False)):
         mean, spread = np.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel).center
         y = second[:size, :size]
@@ -77,7 +77,7 @@ def test_a_relay_that_filters_in_the_shadow_of_its_receiver():
 
 
 def test_a_plant_that_changes_with_the_mode():
-    """A mode of the plant that is heard only through it, and another shadow on the link."""
+    """A mode of the plant that is received only through it, and other fading on the link."""
     plants = [
         GainAndNoise(Constant(1.0), [[a]], hg.Gaussian([[q]], [b])) for a, q, b in ((0.5, 0.1, 1.0), (0.95, 0.4, 0.0))
     ]

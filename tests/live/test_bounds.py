@@ -125,7 +125,7 @@ def test_in_steps_times_are_steps():
         (drifting(move=lambda x, u: x - u[1] * x), "Jacobian over 0.25 and then 0.75"),  # Euler's
     ],
 )
-def test_a_plant_whose_intervals_cannot_be_cut_is_told(plant, what):
+def test_a_plant_whose_intervals_cannot_be_cut_is_informed(plant, what):
     with pytest.warns(UserWarning, match=f"timeline: predictions depend on when others are asked for: {what}"):
         hg.Timeline(network_of(plant), 5.0)
 

@@ -1,4 +1,4 @@
-"""A timeline has the bits of filters that heard everything in order, whatever the order, and it never grows."""
+"""A timeline has the bits of filters that received everything in order, whatever the order, and it never grows."""
 
 import itertools
 
@@ -62,7 +62,7 @@ def assert_same_bits(item, other):
 
 
 def in_order(network, accepted, now):
-    """A filter that hears what was accepted, in order, each at once."""
+    """A filter that receives what was accepted, in order, each at once."""
     item = timeline(network)
     places = {name: i for i, name in enumerate(("inputs", *network.names))}
     for event in sorted(accepted, key=lambda e: (e.time, places[e.node], e.sequence)):
@@ -154,21 +154,21 @@ def test_its_estimates_are_those_of_run(world):
     rows, held, last = [], np.zeros(1), 0.0
     for event in result:
         if not rows or not (joint and rows[-1]["time"] == event.time):
-            rows.append({"time": event.time, "u": [held, event.time - last], "heard": {}})
+            rows.append({"time": event.time, "u": [held, event.time - last], "received": {}})
         last = event.time
         if event.node == "inputs":
             held = event.values
             rows[-1]["u"][0] = rows[-1]["u"][0] if world.continuous else held
         else:
-            rows[-1]["heard"][event.node] = event.values
+            rows[-1]["received"][event.node] = event.values
     if not world.continuous:  # every step has a row
         at = {row["time"]: row for row in rows}
         for k in range(int(last) + 1):
-            at.setdefault(float(k), {"u": None, "heard": {}})
+            at.setdefault(float(k), {"u": None, "received": {}})
         rows = [at[float(k)] for k in range(int(last) + 1)]
         for before, row in itertools.pairwise([{"u": [np.zeros(1)]}, *rows]):
             row["u"] = row["u"] or before["u"]
-    z = {node: np.array([row["heard"].get(node, [np.nan]) for row in rows]) for node in network.nodes}
+    z = {node: np.array([row["received"].get(node, [np.nan]) for row in rows]) for node in network.nodes}
     u = np.array([np.ravel(row["u"][0]) for row in rows])
     if world.continuous:
         u = np.column_stack([u, [row["u"][1] for row in rows]])

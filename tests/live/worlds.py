@@ -53,7 +53,7 @@ def remembering() -> hg.Network:
         "polynomial": hg.polynomial_filter(*sure, STEPS),
         "scheduled": hg.filters.scheduled_polynomial_filter(*sure, STEPS),
     }  # fmt: skip
-    known = {"told": hg.filters.side_information_filter(PLANT, SENSOR, LOSSES)}
+    known = {"informed": hg.filters.side_information_filter(PLANT, SENSOR, LOSSES)}
     nodes = {"a": hg.Node(*parts[1:], local), "b": hg.Node(SENSOR, LOSSES, known), "c": hg.Node(*sure[1:], gains)}
     return hg.Network(PLANT, nodes)
 

@@ -27,7 +27,7 @@ MODES = hg.random_affine.Modes
         (hg.model.delayed(CLEAN, 2, timestamped=True), (0,), (0,)),
     ],
 )
-def test_gain_one_noise_and_losses_that_are_told(channel, sent, result):
+def test_gain_one_noise_and_losses_that_are_informed(channel, sent, result):
     assert carried(channel, sent) == result
 
 

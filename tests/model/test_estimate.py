@@ -50,3 +50,27 @@ def test_a_table_of_statistics_claims_nothing_of_what_failed():
         frame = hg.monte_carlo(network, 4, 64, 1, keep=hg.Statistics()).to_pandas()
         hg.monte_carlo(network, 4, 64, 1, keep=hg.Statistics())["a"]["f"].rmse()
     assert frame["claim"].tolist() == ["none"]
+
+
+def test_a_live_estimate_whose_covariance_is_lost_claims_nothing():
+    """Saved gains lose theirs where data are missing; the mean goes on, in a stream and in a timeline."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    item = hg.filters.scheduled_polynomial_filter(plant, sensor, hg.perfect(), 6, 1)
+    stream, expected = hg.Stream(item), ["exact", "none", "none"]
+    timeline = hg.Timeline(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": item})}), window=10.0)
+    for k, (z, claim) in enumerate(zip((0.1, np.nan, 0.2), expected, strict=True)):
+        assert stream.push([z]).claim == claim
+        timeline.push("a", k, k, [z])
+        result = timeline.estimates()["a"]["f"]
+        assert result.claim == claim and np.isfinite(result.mean).all()
+    timeline.advance(100.0)
+    assert timeline.final().estimates["a"]["f"].claims.tolist() == expected
+
+
+def test_a_measurement_that_would_lose_the_covariance_is_refused_live_and_the_claim_stays():
+    _, _, item = lost()
+    stream = hg.Stream(item)
+    before = stream.push([0.0])
+    with pytest.raises(ValueError, match="with it the estimate is no number, or its covariance is none"):
+        stream.push([0.1])
+    assert stream.steps == 1 and before.claim == "exact"

@@ -26,10 +26,10 @@ def network(slots, relays=("a",), plant=PLANT, sensor=SENSOR):
         ([], "slots: expected at least one"),
         (
             [{"a": {}, "receiver": {}}],
-            "relay 'a': expected to hear the sensor or another relay in some slot, got nobody",
+            "relay 'a': expected to receive the sensor or another relay in some slot, got nobody",
         ),
         ([{"a": {"sensor": LINK}}], "somebody transmits to the receiver, got a schedule in which nobody does"),
-        ([{"a": {"a": LINK}, "receiver": {"a": LINK}}], "relay 'a': expected to hear .* got itself only"),
+        ([{"a": {"a": LINK}, "receiver": {"a": LINK}}], "relay 'a': expected to receive .* got itself only"),
         ([{"b": {"sensor": LINK}}], "listener in slot 0: expected one of .* got 'b'"),
         ([{"a": {"sensor": LINK}, "receiver": {"receiver": LINK}}], "sender: expected one of .* got 'receiver'"),
         ([{"a": {"sensor": hop(0.8, 0.1, dimension=2)}}], "one that takes 1 numbers, got one that takes 2"),

@@ -34,7 +34,7 @@ def test_names_are_checked():
 
 
 def heading(x: jax.Array) -> jax.Array:
-    """A turn by 3 from a heading, told between -pi and pi."""
+    """A turn by 3 from a heading, given between -pi and pi."""
     y = x[0] + 3.0 + 0.1 * x[1]
     return jnp.stack([jnp.arctan2(jnp.sin(y), jnp.cos(y)), x[1]])
 

@@ -1,4 +1,4 @@
-"""Known numbers and traced ones are told apart wherever they stand."""
+"""Known numbers and traced ones are distinguished wherever they stand."""
 
 import jax
 import numpy as np

@@ -46,7 +46,7 @@ def of_unknown(parts, pair, first, second, noise):
 
 
 def of_known(parts, delays, first, second, noise):
-    """The same for known delays d_1, ..., d_T: what is heard twice is one y, with two noises."""
+    """The same for known delays d_1, ..., d_T: what is received twice is one y, with two noises."""
     law = max(delays) + 1
 
     def pair(k, j):

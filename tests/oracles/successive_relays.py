@@ -233,7 +233,7 @@ def constant(
 
 
 def section_iv(horizon: int, Gam: Array = PRINTED_GAMMA) -> Problem:
-    """The example of Section IV, with the printed Gamma (four decimals) unless told otherwise."""
+    """The example of Section IV, with the printed Gamma (four decimals) unless given otherwise."""
     small = np.array([[4e-6]])
     return constant(
         horizon,

@@ -62,7 +62,7 @@ def test_delays_in_series_add_up():
 
 REFUSED = {
     "time stamps: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, timestamped=True)]),
-    "series: expected links that are late each": lambda: hg.amplify_and_forward(
+    "series: expected links each delayed": lambda: hg.amplify_and_forward(
         [LINK, hg.model.with_direct_link(delayed(LINK, 1), LINK)]
     ),
     "time stamps: expected those of one link": lambda: hg.amplify_and_forward(

@@ -35,10 +35,10 @@ CHANNELS = {
     "a drift": drift(),
     "a drift and a chain": hg.model.with_direct_link(hg.amplify_and_forward([drift(), link()]), NOISY),
     "one drift twice": hg.amplify_and_forward([drift("hill"), drift("hill")]),
-    "loss that is not told": hg.dropout(hg.parallel([link(), drift()]), 0.6),
+    "loss that is not observed": hg.dropout(hg.parallel([link(), drift()]), 0.6),
 }
 
-LARGE = {"chains of their own", "one chain", "a drift and a chain", "one drift twice", "loss that is not told"}
+LARGE = {"chains of their own", "one chain", "a drift and a chain", "one drift twice", "loss that is not observed"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])

@@ -1,4 +1,4 @@
-"""What a receiver is told: outcomes against draws."""
+"""Side information of a receiver: outcomes against draws."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""A server of both kinds of brokers, and what is sent to it and heard of it."""
+"""A server of both kinds of brokers, and what is sent to it and received of it."""
 
 import asyncio
 from collections.abc import Iterator

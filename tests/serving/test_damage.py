@@ -1,4 +1,4 @@
-"""A store of which bytes have changed: the damage is named, and no wrong number is used or told."""
+"""A store of which bytes have changed: the damage is named, and no wrong number is used or published."""
 
 import json
 import sqlite3
@@ -26,7 +26,7 @@ def mine():
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, mine):
-    """A store in which half of the messages were used, of which nothing was told; one file, for it was closed."""
+    """A store in which half of the messages were used, of which nothing was published; one file, for it was closed."""
     place = tmp_path_factory.mktemp("whole") / "a.db"
     service = Service(fleet(stepping()), Store(str(place), mine))
     for begin in range(0, HALF, 4):
@@ -106,7 +106,7 @@ def test_a_damaged_plant_is_refused_by_name_and_the_others_go_on(whole, tmp_path
     changed(place, f"update plants {how} where name = 'p1'")
     estimates, refused = gone_on(place, mine)
     assert without_numbers(estimates["p0"]) == without_numbers(right["p0"]) != []
-    assert all(estimate in right["p1"] for estimate in estimates["p1"])  # what was told before
+    assert all(estimate in right["p1"] for estimate in estimates["p1"])  # what was published before
     assert {item["reason"] for item in refused if item["plant"] == "p1"} == {"damaged"}
     assert all(f"{place}, plant 'p1': expected" in item["detail"] for item in refused if item["plant"] == "p1")
     assert all("--anew p1 begins it anew" in item["detail"] for item in refused if item["plant"] == "p1")
@@ -198,7 +198,7 @@ def test_a_store_of_the_layout_before_is_refused_by_its_number(tmp_path, mine):
         Store(str(place), mine)
 
 
-def test_no_byte_of_the_file_changes_what_is_told(whole, tmp_path, mine):
+def test_no_byte_of_the_file_changes_what_is_informed(whole, tmp_path, mine):
     """Either all goes on as if nothing had happened, or the damage is named in one line."""
     right, others = gone_on(copy(whole, tmp_path), mine)
     data, place = whole.read_bytes(), tmp_path / "a.db"

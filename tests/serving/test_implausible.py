@@ -1,4 +1,4 @@
-"""Absurd messages among good ones: what is told is that of a service without them, bit for bit; they are counted."""
+"""Absurd messages among good ones: outputs are those of a service without them, bit for bit; they are counted."""
 
 import json
 import sys

@@ -3,13 +3,13 @@
 import json
 
 import pytest
-from heliograph.serving.storage.in_memory_store import InMemoryStore
 
 import heliograph as hg
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.output import Estimates
 from heliograph.serving.service import Service
+from heliograph.serving.storage.store_protocol import InMemoryStore
 
 PLANT, SENSOR, LINK = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01), hg.perfect()
 

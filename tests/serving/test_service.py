@@ -21,7 +21,7 @@ READER = TypeAdapter(AnyOutput)
 
 
 def served(network, sent, size, **options):
-    """All that is told, as JSON, of messages in batches of this size."""
+    """All that is published, as JSON, of messages in batches of this size."""
     service = Service(fleet(network, **options), InMemoryStore())
     outputs = []
     for begin in range(0, len(sent), size):
@@ -188,7 +188,7 @@ def test_no_plant_begins_with_a_wrong_clock():
 
 @given(st.randoms(use_true_random=False), st.floats(0, 0.6))
 def test_lost_is_what_never_came_in_whatever_order_the_rest_did(chance, loss):
-    """Between the first and the last that were heard; then the node is started again, and counts from 0."""
+    """Between the first and the last that were received; then the node is started again, and counts from 0."""
     link, lost = Link(), 0
     for boot in range(2):
         received = [k for k in range(1, 20) if chance.random() > loss]

@@ -132,7 +132,7 @@ def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Serv
 
 
 def finals(bodies) -> dict[str, list[str]]:
-    """Final estimates of each plant in the order of time, without their numbers; told again they count once."""
+    """Final estimates of each plant in the order of time, without their numbers; published again they count once."""
     known: dict[str, dict[float, str]] = {}
     for body in bodies:
         content = json.loads(body)
@@ -144,7 +144,7 @@ def finals(bodies) -> dict[str, list[str]]:
 
 
 async def everything(client: nats.NATS) -> list[bytes]:
-    """What the server keeps of what was told."""
+    """What the server keeps of what was published."""
     stream = client.jetstream(timeout=60)
     reader = await stream.subscribe("fleet.out.final.*", stream="fleet-out", ordered_consumer=True)
     count = (await stream.stream_info("fleet-out")).state.messages

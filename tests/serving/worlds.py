@@ -17,7 +17,7 @@ WINDOW = 5.0
 
 @cache
 def moving() -> hg.Network:
-    """Continuous time: a position driven by noise and a speed that is given, heard by two nodes."""
+    """Continuous time: a position driven by noise and a speed that is given, received by two nodes."""
     plant = hg.Plant(lambda x, u: x + u[0] * u[1], lambda u: jnp.diag(0.3 * u[1:]), [0.0], 1.0, inputs=["speed", "dt"])
     node = hg.Node(SENSOR, HOP, {"cubature": hg.cubature_filter(plant, SENSOR, HOP)})
     return hg.Network(plant, {"a": node, "b": node})

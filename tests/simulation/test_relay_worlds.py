@@ -27,7 +27,7 @@ FALSE_ALARM = 1e-4  # of each comparison over all its steps
 def world(net, design):
     schedules = relay_schedules(net, design)
     receivers = {
-        "own": ScheduledFilter(schedules.pop("receiver")),
+        "local": ScheduledFilter(schedules.pop("receiver")),
         "best": ScheduledFilter(receiver_behind_relays(net, design.gains)),
     }
     return schedules, receivers
@@ -82,7 +82,7 @@ def test_a_wrong_design_is_seen(designed):
                            output=gains.transition + 0.5 * gains.gain @ gains.expected)  # fmt: skip
     schedules["relay_2"] = type(schedules["relay_2"])(moved, schedules["relay_2"].start, "exact")
     record = monte_carlo(Network.of_relays(example(), schedules, receivers), 20, RUNS, 1, chunk=CHUNK)
-    largest, limit = worst(record, "relay_2", "own")
+    largest, limit = worst(record, "relay_2", "local")
     assert largest > 2 * limit
 
 
@@ -110,16 +110,16 @@ def test_what_holds_for_every_network_holds_for_relays(designed, recorded):
         monte_carlo(network, 20, 96, 1, Statistics(), chunk=c, progress=lambda *n: outputs.append(n)) for c in (32, 96)
     ]
     assert outputs == [(32, 96), (64, 96), (96, 96), (96, 96)]
-    single, other = (s["relay_2"]["own"] for s in sums)
+    single, other = (s["relay_2"]["local"] for s in sums)
     np.testing.assert_array_equal(single.outer, other.outer)
-    stored = error_statistics(whole, "relay_2", "own")
+    stored = error_statistics(whole, "relay_2", "local")
     np.testing.assert_allclose(stored.outer, single.outer, rtol=1e-12)
     np.testing.assert_allclose(stored.covariance, single.covariance, rtol=1e-12)
     np.testing.assert_allclose(stored.nees, single.nees, rtol=1e-9)
 
 
 def quiet():
-    """One relay, which listens and talks in turn, so that the receiver hears it every other step."""
+    """One relay, which listens and talks in turn, so that the receiver receives it every other step."""
     hops = hop(0.9, 0.1), hop(0.8, 0.2)
     slots = [{"a": {"sensor": hops[0]}}, {"receiver": {"a": hops[1]}}]
     plant = LinearPlant([[0.95]], [[1.0]], [1.0], [[2.0]])
@@ -142,7 +142,7 @@ def test_single_precision_tells_the_same_story_behind_relays(silences):
     """Other draws of the same laws: RMSE within 4 standard errors of their difference."""
     network, record = silences
     single = monte_carlo(network, 12, RUNS, 2, Statistics(), chunk=CHUNK, precision="float32")
-    for node, name in (("a", "own"), ("receiver", "own"), ("receiver", "best")):
+    for node, name in (("a", "local"), ("receiver", "local"), ("receiver", "best")):
         (a, a_error), (b, b_error) = (s.rmse() for s in (single[node][name], error_statistics(record, node, name)))
         assert a != b and abs(a - b) < 4 * np.hypot(a_error, b_error)
 
@@ -152,14 +152,14 @@ def test_a_planned_silence_is_no_gap_and_a_loss_is_one(silences):
     received = record.measurements["receiver"]
     assert np.all(np.isnan(received[:, ::2])) and np.all(np.isfinite(received[:, 1::2]))
     assert record.failures() == []
-    for name in ("own", "best"):
+    for name in ("local", "best"):
         claimed = record.estimates["receiver"][name].covariance
         assert np.all(np.isfinite(claimed)) and np.array_equal(claimed[0], claimed[-1])
-    largest, limit = worst(record, "receiver", "own")
+    largest, limit = worst(record, "receiver", "local")
     assert largest < limit
     lost = received[3].copy()
     lost[5] = np.nan
-    bound = run(network, {"receiver": lost}).estimates["receiver"]["own"].covariance
+    bound = run(network, {"receiver": lost}).estimates["receiver"]["local"].covariance
     assert np.all(np.isfinite(bound[:5])) and np.all(np.isnan(bound[5:]))
 
 
@@ -197,7 +197,7 @@ def staying(noise):
 
 
 def test_hops_that_remember_keep_their_state():
-    """Without noise, what is heard over what was sent is one number for each run and hop."""
+    """Without noise, what is received over what was sent is one number for each run and hop."""
     plant = LinearPlant([[1.0]], [[0.0]], [1.0], [[1.0]])
     sensor = LinearSensor([[1.0]], [[0.0]])
     node = Network(plant, {"n": Node(sensor, staying(0.0), {})})

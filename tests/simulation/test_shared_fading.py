@@ -21,7 +21,7 @@ CHAIN = hg.random_affine.MarkovChain(BURSTS, name="valley")
 
 
 def gains(channels):
-    """What each node hears, (run, time): its gain."""
+    """What each node receives, (run, time): its gain."""
     nodes = {name: hg.Node(SENSOR, channel, {}) for name, channel in channels.items()}
     record = hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 7)
     return {name: record.measurements[name][..., 0] for name in channels}

@@ -85,3 +85,26 @@ def test_what_a_precise_future_leaves_keeps_its_digits():
     ends = precise * (4 * steps - 2) / (steps**2 + steps)
     np.testing.assert_allclose(result[:, 1, 1], velocity, rtol=1e-4)  # of a prior correlated by 1 - 1e-10: 1e-6 remain
     np.testing.assert_allclose(result[[0, -1], 0, 0], ends, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "smoothing", [hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(3), hg.smoothing.FixedPoint(1)]
+)
+def test_a_state_that_later_data_tell_exactly_is_smoothed_to_its_rounding(smoothing):
+    """Both states are a multiple of one number, at first unseen, then seen without noise, and known from there on.
+
+    The innovations that follow are rounding, and so is their variance: an adjoint that divides by it is 1e15 too large
+    when the update that told the states is to take it off again.
+    """
+    plant = hg.LinearPlant([[0.8, 0.32], [-1.26, 0.88]], 0.0, [0.5, -0.7], np.outer([0.3, 0.03], [0.3, 0.03]))
+    sensor, channel = hg.LinearSensor([[-0.16, -0.48], [0.6, 0.04]], 0.0), hg.erasure(hg.perfect(2), 0.7)
+    items = {"linear": hg.linear_filter(plant, sensor, hg.perfect(2)), "kalman": hg.kalman_filter(plant, sensor)}
+    network = hg.Network(plant, {"a": hg.Node(sensor, channel, items)})
+    record = hg.monte_carlo(network, 12, 100, 1, smooth=smoothing)
+    for name, item in record.smoothed.estimates["a"].items():
+        assert (item.claims == "exact").all()
+        squared, variance = record.smoothed.errors("a", name) ** 2, np.einsum("...ii->...i", item.covariance)
+        assert (squared <= 60 * variance + 1e-30).all()  # 7.7 deviations, or (4 eps)^2 of states of size one
+        seen = ~np.isnan(record.measurements["a"][:, 1]).any(axis=-1)  # at the second step
+        if not isinstance(smoothing, hg.smoothing.FixedPoint):
+            assert variance[seen, 0].max() < 1e-16  # rounding of P, where the first was unseen

@@ -18,7 +18,7 @@ def outcome():
     score = compute.Late("nominal", mean, 2 * mean, 0.01, over_time, 2 * over_time, {})
     before = {"true_before_data": mean, "true_before_data_over_time": over_time}
     known = replace(score, claim="exact", before_data=before)
-    late = {name: known if name in ("untold", "as_current", "none") else score for name in figures.LATE}
+    late = {name: known if name in ("uninformed", "as_current", "none") else score for name in figures.LATE}
     parts = dict.fromkeys(("position", "offset", "drift"), compute.Deviation(1.0, 1.0, np.ones(300), np.ones(300)))
     clocks = {kind: dict.fromkeys(figures.CLOCKS, parts) for kind in figures.SITUATIONS}
     return compute.Outcome({"delays": 4096, "clocks": 1024}, {"delays": 60, "clocks": 300}, late, 0.6, clocks)
@@ -33,7 +33,7 @@ def test_the_filters_are_those_that_are_shown():
 def test_the_summary(outcome):
     summary = json.loads(json.dumps(delays.example.summary(delays.Setting(), outcome, {})))
     assert set(summary["delays"]) == set(figures.LATE)
-    assert summary["delays"]["untold"]["true_before_data"] == pytest.approx(np.linspace(0.4, 0.2, 60)[30:].mean())
+    assert summary["delays"]["uninformed"]["true_before_data"] == pytest.approx(np.linspace(0.4, 0.2, 60)[30:].mean())
     assert set(summary["clocks"]) == {"moving", "at_rest", "no_true_clock"}
     assert summary["clocks"]["moving"]["guarded"]["offset"] == {"true": 1.0, "claimed": 1.0}
     assert summary["past_states_claim"] == 0.6

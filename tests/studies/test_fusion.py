@@ -34,6 +34,6 @@ def test_the_summary_has_every_rule_in_its_order(tmp_path, fits):
     assert {"ci_equal", "matrix", "all_reports", "central"} <= set(summary["strong"])
     every, rarely = summary["traffic"]["every"]
     assert every["claimed"] < rarely["claimed"] and every["reports"] == 2 * rarely["reports"]
-    (known,) = summary["traffic"]["told"]
+    (known,) = summary["traffic"]["informed"]
     assert known["claimed"] > known["error"] and known["reports"] < 1
     assert {"traces.svg", "tree.svg", "traffic.svg"} <= {p.name for p in (tmp_path / "fusion").iterdir()}

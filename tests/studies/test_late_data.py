@@ -41,7 +41,7 @@ def test_a_log_is_read_as_the_testbed_wrote_it(tmp_path):
         row(2, 301, 70_100, 70_130),
         row(2, 300, 70_000, 70_140),  # a copy
         "",
-        row(2, 302, 70_300, 70_299),  # heard before it was sent
+        row(2, 302, 70_300, 70_299),  # received before it was sent
         row(0, 302, 70_300, 70_310),  # from nobody
         row(2, 302, 70_300, 70_310)[:40],  # cut off
         row(2, 302, 70_300, 70_310).replace("26", "256"),
@@ -54,7 +54,7 @@ def test_a_log_is_read_as_the_testbed_wrote_it(tmp_path):
 
 
 def test_losses_are_gaps_within_a_boot_sorted_by_the_time_of_sending(tmp_path):
-    """Node 2: 1 2 . 4 5, heard with 4 and 2 swapped; a reboot: 1 . . 4; a lone packet of node 9 after 300 others."""
+    """Node 2: 1 2 . 4 5, received with 4 and 2 swapped; a reboot: 1 . . 4; a lone packet of node 9 after 300 others."""
     first = [(1, 10), (4, 40), (2, 20), (5, 50)]
     again = [(1, 110), (4, 140)]
     rows = [row(2, n, slot, slot + 35 if n == 2 else slot + 5) for n, slot in first + again] + [row(9, 300, 60, 61)]

@@ -27,7 +27,7 @@ def test_what_is_learned_starts_at_the_truth():
     for row in ROWS:
         result = hg.learning.describe(lambda row=row: learned(row)).parameters
         assert {item.name: float(item.start) for item in result.every} == pytest.approx(true_values(row))
-        assert world(row).nodes["node"].received == (1 if row.law == "untold" else 2)
+        assert world(row).nodes["node"].received == (1 if row.law == "uninformed" else 2)
 
 
 def stages(folder):
@@ -54,7 +54,7 @@ def test_a_batch_is_counted_once_and_kept(tmp_path, monkeypatch):
 @pytest.fixture
 def outcome():
     """As it would be counted, with other numbers."""
-    names = {"untold": ("plant_noise", "hop_noise", "arrival")}
+    names = {"uninformed": ("plant_noise", "hop_noise", "arrival")}
     usual = ("mean_gain", "gain_variance", "hop_noise", "plant_noise", "sensor_noise")
     rng, recordings = np.random.default_rng(0), {}
     for row in ROWS:
@@ -70,7 +70,7 @@ def test_the_summary(outcome):
     summary_ = json.loads(json.dumps(summary(outcome)))
     assert set(summary_["coverage"]) == {row.name for row in ROWS}
     assert set(summary_["coverage"]["rare"]) == {"linear", "conditional"}
-    assert set(summary_["coverage"]["untold"]["conditional"]["cosines"]) == {"plant_noise", "hop_noise", "arrival"}
+    assert set(summary_["coverage"]["uninformed"]["conditional"]["cosines"]) == {"plant_noise", "hop_noise", "arrival"}
     assert summary_["recordings"]["rare"]["linear"] == {"recordings": 640, "left_out": 0.01}
     assert summary_["plaza"] == outcome.plaza
 

@@ -56,7 +56,7 @@ def test_a_mixture():
 
 
 @pytest.mark.slow
-def test_links_that_remember_and_losses_that_are_told():
+def test_links_that_remember_and_losses_that_are_informed():
     """By mode and by what arrives; of a lost packet the moments of what would have come are compared."""
     plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], np.diag([0.1, 0.02]), [1.0, -2.0], np.diag([1.0, 0.5]))
     sensor = hg.LinearSensor([[1.0, 0.5]], 0.1)
@@ -65,7 +65,7 @@ def test_links_that_remember_and_losses_that_are_told():
     filters = {
         "linear": hg.linear_filter(plant, sensor, channel),
         "first_degree": hg.polynomial_filter(plant, sensor, channel, 3, 1),
-        "told": hg.filters.side_information_filter(plant, sensor, hg.erasure(good, 0.7)),
+        "informed": hg.filters.side_information_filter(plant, sensor, hg.erasure(good, 0.7)),
         "imm": hg.filters.imm_filter(plant, sensor, channel),
     }
     nodes = {"mine": hg.Node(sensor, channel, filters), "lossy": hg.Node(sensor, hg.erasure(good, 0.7), filters)}

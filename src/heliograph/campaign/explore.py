@@ -163,7 +163,7 @@ def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None 
 
 
 MEANING = (
-    "**rmse**: root of the mean of the squared error over runs, and over steps unless they are told apart; of all "
+    "**rmse**: root of the mean of the squared error over runs, and over steps unless they are shown apart; of all "
     "states together that of its sum over them.",
     "**claimed**: root of the mean variance that the filter claims.",
     "**nees_per_dimension**: squared error in units of the claimed covariance, per dimension; 1 where that is right, "

@@ -11,6 +11,7 @@ from heliograph.cli.app import app, completion
 from heliograph.cli.design import design
 from heliograph.cli.export import export
 from heliograph.cli.fit import fit
+from heliograph.cli.inspect import inspect
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.run import run
@@ -25,7 +26,7 @@ BAD_INPUT = 2
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO  # files name themselves, what is printed does not
 
 # In the order of the help.
-COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
+COMMANDS = new, inspect, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
 for single in COMMANDS:
     app.command(single)
 

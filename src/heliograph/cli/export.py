@@ -52,18 +52,18 @@ def export(
     print("\n".join(costs(written, measured)))
 
 
-def node_of(network: "Network", filter_: str, node: str | None) -> str:
+def node_of(network: "Network", filter_name: str, node: str | None) -> str:
     """Return the node that has the filter."""
     from heliograph.numerics.check import fail
 
-    having = [name for name in network.names if filter_ in network.nodes[name].filters]
+    having = [name for name in network.names if filter_name in network.nodes[name].filters]
     if not having:
         known = sorted({name for item in network.nodes.values() for name in item.filters})
-        raise fail("--filter", f"one of the network's filters {known}", repr(filter_))
+        raise fail("--filter", f"one of the network's filters {known}", repr(filter_name))
     if node is None and len(having) > 1:
-        raise fail("--node", f"one of {having}, which all have a filter {filter_!r}", "none")
+        raise fail("--node", f"one of {having}, which all have a filter {filter_name!r}", "none")
     if node is not None and node not in having:
-        raise fail("--node", f"one that has a filter {filter_!r} {having}", repr(node))
+        raise fail("--node", f"one that has a filter {filter_name!r} {having}", repr(node))
     return having[0] if node is None else node
 
 

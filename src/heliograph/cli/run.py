@@ -13,6 +13,9 @@ import heliograph
 from heliograph.cli.app import place
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
@@ -24,8 +27,8 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or events.")],
-    out: Annotated[Path | None, place("CSV or Parquet to write: estimates with their claimed covariances.")] = None,
+    measurements: Annotated[Path, place("CSV or Parquet: rows or events; or a bag.")],
+    out: Annotated[Path | None, place("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
     report: Annotated[Path | None, place("Folder for figures and a page on estimates, innovations and links.")] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
@@ -35,6 +38,8 @@ def run(
 
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
     Then the estimates are those that became final; with --lag, those of a lag later go to a second file, OUT.lagged.
+    A bag (.mcap, .db3, .bag, or a folder) is events too, by the `sources` of the network's file; with --smooth or
+    --report it is rows in the order of measuring.
 
     Parameters
     ----------
@@ -42,7 +47,9 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.cli.mapped import read_mapped
     from heliograph.disk.quoting import visible
+    from heliograph.files.bag import is_bag
     from heliograph.files.events import holds_events
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
@@ -51,30 +58,39 @@ def run(
     # Check the options before JAX is imported.
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
-    later, events = named_smoothing(smooth), holds_events(measurements)
+    bag = is_bag(measurements)
+    later, events = named_smoothing(smooth), holds_events(measurements) or (bag and not smooth and report is None)
     _check_requested(measurements, out, report, later is not None, events, window is not None or lag is not None)
     notes: list[str] = []
     doubtful: list[str] = []
-    with progress(3) as advance:
+    with progress(4) as advance:
         advance("starting")
         from heliograph.files.events import run_events
-        from heliograph.files.network_file import load_network
-        from heliograph.files.recording import read_recording, write_estimates
+        from heliograph.files.network_file import load_module
+        from heliograph.files.recording import read_recording
 
-        # Filter: events through a timeline, rows at once.
-        loaded = load_network(network)
+        # Messages of a bag become events; a network's file says which.
+        loaded, module = load_module(network)
         if not any(node.filters for node in loaded.nodes.values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
-        if events and out is not None:
+        messages = read_mapped(measurements, network, loaded, module, advance)
+        write = _writer(messages, module)
+        # Filter: events through a timeline, rows at once.
+        if out is not None and (events or (messages is not None and not smooth and report is None)):
             advance("filtering events")
-            record, notes = run_events(measurements, loaded, out, 10.0 if window is None else window, lag)
+            record, notes = run_events(
+                measurements, loaded, out, 10.0 if window is None else window, lag, messages, write
+            )
         else:
-            recording = read_recording(measurements, loaded)
+            recording = read_recording(measurements, loaded) if messages is None else messages.recording()
             advance(f"filtering {len(recording.time)} rows")
             record, doubtful = _filtered(loaded, recording, later)
         if out is not None:
             advance(f"writing {out}")
-            write_estimates(record, out)
+            write(record, out)
+    if messages is not None:
+        notes += messages.notes
+        doubtful += [messages.broken] if messages.broken else []
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, record, recording, report)
@@ -96,6 +112,22 @@ def _check_requested(
     if not events and waits:
         raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
     _check_places(measurements, out, report)
+
+
+def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Callable[[Record, Path], None]":
+    """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
+    from heliograph.files.bag_output import write_bag
+    from heliograph.files.recording import write_estimates
+
+    origin = None if messages is None or messages.steps else messages.date
+
+    def write(record: "Record", path: Path) -> None:
+        if path.suffix.lower() == ".mcap":
+            write_bag(record, path, origin, module.get("pose"))  # type: ignore[arg-type]  # it says what it expects
+        else:
+            write_estimates(record, path)
+
+    return write
 
 
 def _filtered(
@@ -139,11 +171,11 @@ def _claim(estimate: "Estimate") -> str:
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
     """Check before the work starts that files can be written."""
-    from heliograph.disk.output_file import check_output
+    from heliograph.disk.output_file import FORMATS, check_output
     from heliograph.numerics.check import fail
 
     if out is not None:
-        check_output(out)
+        check_output(out, (*FORMATS, ".mcap"))
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:

@@ -27,12 +27,15 @@ def serve(
         list[str] | None,
         Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),
     ] = None,
-    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
+    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, or opc.tcp://host:port.")] = None,
     parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
 ) -> None:
     """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
+
+    Where the network's file names `sources`, messages of their topics are read too: of the broker, or of lines with a
+    topic and a payload, as mosquitto_sub -F %j prints them.
 
     Parameters
     ----------
@@ -43,7 +46,7 @@ def serve(
     import asyncio
     import json
 
-    from heliograph.files.network_file import load_network
+    from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
     from heliograph.serving.brokers.url import address
     from heliograph.serving.fleet import Options
@@ -60,8 +63,18 @@ def serve(
     # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    store_ = store_of(network, store, parts)
+    opened = store_of(network, store, parts)
+    loaded, module = load_module(network)
     settings = ServiceSettings(
-        load_network(network), options, store_, process, from_snapshot, where, parts, page, tuple(anew or ())
+        loaded,
+        options,
+        opened,
+        process,
+        from_snapshot,
+        where,
+        parts,
+        page,
+        tuple(anew or ()),
+        module.get("sources"),
     )
     asyncio.run(run(settings))

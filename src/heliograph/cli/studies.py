@@ -50,12 +50,13 @@ def example(
     out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
     seed: Annotated[int | None, number("Seed of what is simulated; 0 unless given.")] = None,
     trace: Annotated[Path | None, place("Log of a radio network, for an example that takes one.")] = None,
+    recording: Annotated[Path | None, place("Folder of a recording, for an example that takes one.")] = None,
     changes: Changes | None = None,
 ) -> None:
     """Run an example and report, or list them."""
     if name is None:
         return print_list("example")
-    run([name], out, changed(changes, seed=seed, trace=trace), "example")
+    run([name], out, changed(changes, seed=seed, trace=trace, recording=recording), "example")
 
 
 def reproduce(

@@ -60,9 +60,9 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
     return export_named(filter, path, precision, None)
 
 
-def export_named(filter_: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
+def export_named(filter: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
     """Write as `export_c`, with names for the components of z; without names the sensor's, or z0, z1, ..."""
-    item: AbstractFilter = instance("export", filter_, AbstractFilter, "a filter")
+    item: AbstractFilter = instance("export", filter, AbstractFilter, "a filter")
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), shown(precision))

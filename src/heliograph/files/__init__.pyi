@@ -1,7 +1,16 @@
 """Public names of the room; the package loads them when first used."""
 
+from .bag_output import (
+    Pose as Pose,
+)
+from .event_table import (
+    EventTable as EventTable,
+)
 from .fitted import (
     load_fitted as load_fitted,
+)
+from .messages import (
+    read_messages as read_messages,
 )
 from .network_file import (
     load_network as load_network,
@@ -11,6 +20,10 @@ from .recording import (
     read_recording as read_recording,
     write_estimates as write_estimates,
     write_recording as write_recording,
+)
+from .sources import (
+    Source as Source,
+    json_field as json_field,
 )
 from .table import (
     read_table as read_table,

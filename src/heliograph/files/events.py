@@ -1,13 +1,14 @@
 """Files of events: one row for each received message, in any order, with names of nodes and possibly dates."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heliograph.disk.output_file import FORMATS
+from heliograph.files.event_table import EventTable
 from heliograph.files.recording import TIME_STEP, write_estimates
 from heliograph.live.event import INPUTS, Event, whole
 from heliograph.live.recorded import play
@@ -72,18 +73,35 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
     return events, origin
 
 
-def run_events(path: Path, network: Network, out: Path, window: float, lag: float | None) -> tuple[Record, list[str]]:
+def run_events(
+    path: Path,
+    network: Network,
+    out: Path,
+    window: float,
+    lag: float | None,
+    table: EventTable | None = None,
+    write: Callable[[Record, Path], None] = write_estimates,
+) -> tuple[Record, list[str]]:
     """Return final estimates from a file of events, and a summary in lines: verdicts, and the file of lagged estimates.
 
-    With a lag these are written next to `out`: estimates.csv becomes estimates.lagged.csv.
+    With a lag these are written next to `out` by `write`: estimates.csv becomes estimates.lagged.csv. `table` has the
+    events of the file if they were read from messages.
 
     Raises:
         ValueError: what `read_events` and `Timeline` refuse, a lag beyond the window.
     """
-    events, origin = read_events(path, network)
+    # Events of a table, or of messages, with the date from which their times count.
+    events: Iterable[Event]
+    if table is None:
+        events, origin = read_events(path, network)
+        first = min(event.time for event in events)
+    else:
+        events, first = table.in_order(), 0.0
+        origin = None if table.steps else table.date
     continuous = TIME_STEP in network.inputs
-    start = min(event.time for event in events) if continuous else 0.0  # the initial law is that of the first moment
+    start = first if continuous else 0.0  # the initial law is that of the first moment
     result = play(network, events, window, lag, start)
+    # Summary: verdicts by node, what was forced, and the file of lagged estimates.
     lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in element.items() if count)
              for node, element in result.counts.items() if any(element.values())]  # fmt: skip
     if result.forced:
@@ -92,7 +110,7 @@ def run_events(path: Path, network: Network, out: Path, window: float, lag: floa
         lines.append(f"times in seconds since {np.datetime_as_string(origin, timezone='UTC')}")
     if result.lagged is not None:
         lagged_path = out.with_suffix(f".lagged{out.suffix}")
-        write_estimates(result.lagged, lagged_path)
+        write(result.lagged, lagged_path)
         lines.append(f"{lagged_path}: {len(result.lagged.time)} rows, each given what came {lag:g} later")
     return result.final, lines
 

@@ -4,7 +4,7 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
@@ -32,6 +32,11 @@ def load_network(reference: str) -> Network:
         ValueError: no such module, an error inside it (with its type, message and line), no network, or several and no
             name. One line that names the module.
     """
+    return load_module(reference)[0]
+
+
+def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
+    """Load a network as `load_network` does, and whatever else its module names, such as `sources` and `pose`."""
     file_path("network", reference)
     place, _, name = str(reference).rpartition(":")
     if not place or not name.isidentifier():  # no name, or the colon of a drive letter
@@ -42,11 +47,11 @@ def load_network(reference: str) -> Network:
             raise fail(f"network {place}", "a Python file", "a folder" if path.is_dir() else "nothing of that name")
         with _importing_from(path.parent):
             module = _guarded(lambda: _run_file(path), place, path)
-            return _pick(module, name, place, path)
+            return _pick(module, name, place, path), vars(module)
     with _importing_from(Path.cwd()):
         source = _guarded(lambda: _source(place), place, None)
         module = _guarded(lambda: importlib.import_module(place), place, source)
-        return _pick(module, name, place, source)
+        return _pick(module, name, place, source), vars(module)
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:

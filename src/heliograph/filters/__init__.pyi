@@ -1,8 +1,5 @@
 """Public names of the room; the package loads them when first used."""
 
-from .gaussian.adaptive import (
-    AdaptiveFilter as AdaptiveFilter,
-)
 from .base import (
     AbstractFilter as AbstractFilter,
     corrects as corrects,
@@ -68,9 +65,6 @@ from .modes.mode_observed import (
 )
 from .rows import (
     Filtered as Filtered,
-)
-from .gaussian.robust import (
-    RobustFilter as RobustFilter,
 )
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,

@@ -21,8 +21,8 @@ from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
 def gaussian_innovation(
-    z: Float[Array, " m"], expected: Float[Array, " m"], covariance: Float[Array, "m m"]
-) -> Innovation:
+    z: "Float[Array, ' m']", expected: "Float[Array, ' m']", covariance: "Float[Array, 'm m']"
+) -> "Innovation":
     """z - expected and its Gaussian log-likelihood; NaN where a component did not arrive.
 
     Args:
@@ -54,11 +54,11 @@ def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 
 
 def mixed_innovation(
-    weight: Float[Array, " parts"],
-    value: Float[Array, "parts m"],
-    total: Float[Array, "parts m m"],
-    density: Float[Array, ""],
-) -> Innovation:
+    weight: "Float[Array, ' parts']",
+    value: "Float[Array, 'parts m']",
+    total: "Float[Array, 'parts m m']",
+    density: "Float[Array, '']",
+) -> "Innovation":
     """Mean and covariance of the innovation of a mixture: within its components, and between their means.
 
     Args:

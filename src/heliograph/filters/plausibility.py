@@ -28,8 +28,9 @@ LIMIT = 1e6
 
 An update moves the mean by up to d of its deviations, since K S K' <= P. So the mean is rounded to eps d of them, and
 what is a difference of second moments there (E[x x'] - m m', the second differences of a quadratic function) to eps d^2
-of the variance. At d = 1e6 these are 2e-10 and 2e-4 in double precision; in single precision 0.1, and nothing is left
-of second moments. Any bound far below would be a statistical gate, which locks a filter out after an outage.
+of the variance. At d = 1e6 these are 2e-10 and 2e-4 in double precision. In single precision nothing is left of second
+moments from d = eps^-1/2 = 2,900 on: the bound is there (`greatest_distance`). Any bound far below would be a
+statistical gate, which locks a filter out after an outage. Streams, timelines, services and recordings are in double.
 """
 FEW = 36  # numbers of a state of six and its covariance
 
@@ -51,6 +52,11 @@ WORDS = {
     Reason.PREDICTION: "the prediction to its time is no finite number",
 }
 INPUT = "with it the mean loses its digits to rounding"
+
+
+def greatest_distance(dtype: np.dtype) -> float:
+    """Squared distance beyond which an update loses its digits: LIMIT squared, 1 / eps where that is less."""
+    return min(LIMIT**2, 1 / float(np.finfo(dtype).eps))
 
 
 class Judgement(NamedTuple):
@@ -120,10 +126,11 @@ def judge(
 ) -> Judgement:  # fmt: skip
     """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
-    A value is far where the components larger than expected are more than LIMIT deviations off: a smaller one takes the
-    mean to where it has more digits, so that an estimate which is far off can return. It is excluded where all of it is
-    determined and differs from the model, or where no atom of a mixture produces it. A state is unsound where the one
-    before it was not: a mean or variance that is no finite number, a negative variance, an infinite number in it.
+    A value is far where the components larger than expected are too many deviations off (`greatest_distance`): a
+    smaller one takes the mean to where it has more digits, so that an estimate which is far off can return. It is
+    excluded where all of it is determined and differs from the model, or where no atom of a mixture produces it. A
+    state is unsound where the one before it was not: a mean or variance that is no finite number, a negative variance,
+    an infinite number in it.
     """
     (before, prior, after), value = estimates, jnp.asarray(innovation.value)
     z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
@@ -138,7 +145,8 @@ def judge(
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     part, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
     free = jnp.where(larger & ~determined, part, 0.0)
-    far = _some((free > LIMIT**2) | (larger & jnp.isinf(value))) | (_total(free) > LIMIT**2)
+    most = greatest_distance(value.dtype)
+    far = _some((free > most) | (larger & jnp.isinf(value))) | (_total(free) > most)
     # Excluded: all determined, and one of them differs.
     excluded = _some(jnp.isinf(every) & certain) & ~_some(~certain & present)
     if of_atoms:

@@ -16,6 +16,14 @@ from .level import (
     fused_level as fused_level,
     level_weights as level_weights,
 )
+from .mesh.graph import (
+    neighbours_within as neighbours_within,
+)
+from .mesh.rules import (
+    DiffusionWeights as DiffusionWeights,
+    FrozenWeights as FrozenWeights,
+    TraceIntersection as TraceIntersection,
+)
 from .quantizer import (
     AbstractQuantizer as AbstractQuantizer,
     Quantized as Quantized,

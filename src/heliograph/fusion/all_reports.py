@@ -106,9 +106,9 @@ def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
     transition = jnp.concatenate([plant, jnp.concatenate([step.of_state.reshape(size, n), errors], axis=1)])
     # Noise: w is common to all, nu enters by each node's gain.
     shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
-    local = jnp.pad(observation_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
+    report_noise = jnp.pad(observation_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
     drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
-    new = shared @ motion.noise @ shared.T + local
+    new = shared @ motion.noise @ shared.T + report_noise
     later = len(state.mean) - n - size
     # The line of past reports shifts by one step.
     if later:
@@ -174,11 +174,11 @@ def fused_estimate(state: Knowledge, n: int) -> Fused:
 
 def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     """Put the present reports before those of earlier steps."""
-    result = happened.errors
-    mean = result.mean - result.bias
-    blocks = jnp.einsum("iaib->iab", result.joint)
+    errors = happened.errors
+    mean = errors.mean - errors.bias
+    blocks = jnp.einsum("iaib->iab", errors.joint)
     second = (
-        result.covariance - result.local - jnp.swapaxes(result.local, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
+        errors.covariance - errors.local - jnp.swapaxes(errors.local, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
     )
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)

@@ -107,7 +107,7 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
     carried = step.transition @ errors.local  # Cov(T e, x)
     of_state = step.of_state @ errors.covariance
     of_noise = step.of_noise @ motion.noise
-    local = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
+    moved = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
     # Terms of x and w in Cov(e_i+, e_j+), as one product of all nodes.
     left = jnp.concatenate([carried + of_state, step.of_state, of_noise], axis=-1).reshape(nodes * n, -1)
     right = jnp.concatenate([step.of_state, carried, step.of_noise], axis=-1).reshape(nodes * n, -1)
@@ -115,7 +115,7 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
     once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     joint = (both + left @ right.T).reshape(nodes, n, nodes, n)
-    return Errors(mean, covariance, bias, local, joint + observation_noise(step.gain, noise))
+    return Errors(mean, covariance, bias, moved, joint + observation_noise(step.gain, noise))
 
 
 class Factors(NamedTuple):

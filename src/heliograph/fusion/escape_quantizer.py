@@ -169,14 +169,14 @@ class EscapeQuantizer(AbstractQuantizer):
 
 
 def _decay(value: ArrayLike) -> Parameter:
-    result = parameter("decay", value)
-    if not isinstance(result, jax.Array) and np.any((result <= 0) | (result >= 1)):
+    decay = parameter("decay", value)
+    if not isinstance(decay, jax.Array) and np.any((decay <= 0) | (decay >= 1)):
         raise fail("decay", "numbers between 0 and 1", value)
-    return result
+    return decay
 
 
 def _growth(value: ArrayLike) -> Parameter:
-    result = parameter("growth", value)
-    if not isinstance(result, jax.Array) and np.any(result < 0):
+    growth = parameter("growth", value)
+    if not isinstance(growth, jax.Array) and np.any(growth < 0):
         raise fail("growth", "no negative number", value)
-    return result
+    return growth

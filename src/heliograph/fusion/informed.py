@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
+from heliograph.fusion.mesh.gains import Believed, Weights
+from heliograph.fusion.mesh.weights import arrived_scalar_weights, arrived_weights, arrived_weights_by_component
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import Array, Bool, Float, PyTree
 
 Joint = Float[jax.Array, "node n node n"]
 
@@ -71,17 +73,33 @@ class AbstractWeights(AbstractInformedFusion):
         """True if the plant's mean is one of the estimates."""
         return self.with_mean
 
+    @property
+    def needs_joint(self) -> bool:
+        """Always True."""
+        return True
+
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
         """Compute W from P."""
         raise NotImplementedError
 
+    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+        """Compute W from P for those estimates that are present, zero for the others."""
+        raise NotImplementedError
+
+    def neighbour_weights(self, believed: Believed) -> Weights:
+        """Weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
+        if believed.joint is None or self.with_mean:
+            raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
+        chosen = self.arrived(believed.joint, believed.present)
+        return Weights(jnp.eye(len(chosen)), jnp.swapaxes(chosen, 0, 1), weighted(chosen, believed.joint))
+
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Weight the present estimates."""
-        result = happened.errors
-        unbiased, joint = jnp.asarray(means) + result.bias, result.joint
+        errors = happened.errors
+        unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
-            unbiased = jnp.concatenate([unbiased, result.mean[None]])
-            joint = with_mean(result)
+            unbiased = jnp.concatenate([unbiased, errors.mean[None]])
+            joint = with_mean(errors)
         chosen = self.weights(joint)
         # W sums to I: of differences, since digits that W lacks would count against the size of the means.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
@@ -114,6 +132,10 @@ class MatrixWeights(AbstractWeights):
         """Matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
+    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+        """Weights of those that are present."""
+        return arrived_weights(joint, present)
+
 
 class DiagonalWeights(AbstractWeights):
     """Best unbiased fusion component by component: cheaper than `MatrixWeights`, and never better.
@@ -131,6 +153,10 @@ class DiagonalWeights(AbstractWeights):
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
         """Diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
+
+    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+        """Weights of those that are present."""
+        return arrived_weights_by_component(joint, present)
 
 
 class ScalarWeights(AbstractWeights):
@@ -151,3 +177,7 @@ class ScalarWeights(AbstractWeights):
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
         """Scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)
+
+    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+        """Weights of those that are present."""
+        return arrived_scalar_weights(joint, present)

@@ -204,9 +204,9 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
     variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
     limit, to KNOWN of each component's scale, and never less.
     """
-    local = jnp.diagonal(matrices, axis1=1, axis2=2)
-    largest = jnp.max(local, axis=0)
-    reference = jnp.where(local > 0, local, jnp.where(largest > 0, largest, 1.0))
+    variances = jnp.diagonal(matrices, axis1=1, axis2=2)
+    largest = jnp.max(variances, axis=0)
+    reference = jnp.where(variances > 0, variances, jnp.where(largest > 0, largest, 1.0))
     return jax.vmap(_widened_inverse)(matrices, KNOWN * reference)
 
 

@@ -81,10 +81,10 @@ def fused_error_norm(
 
 
 def _levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
-    result = np.asarray(array("levels", levels, (None,)))
-    if not len(result) or np.any(result <= 0):
-        raise fail("levels", "positive numbers", result.tolist())
-    return result
+    checked = np.asarray(array("levels", levels, (None,)))
+    if not len(checked) or np.any(checked <= 0):
+        raise fail("levels", "positive numbers", checked.tolist())
+    return checked
 
 
 def _levels_and_weights(levels: ArrayLike, weights: ArrayLike) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:

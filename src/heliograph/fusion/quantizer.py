@@ -14,6 +14,10 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
+Numbers = TypeAliasType("Numbers", Float[Array, "*n"])
+Flags = TypeAliasType("Flags", Bool[Array, "*n"])
+Counts = TypeAliasType("Counts", Int[Array, "*n"])
+
 
 @readable
 class Quantized(NamedTuple):
@@ -23,10 +27,10 @@ class Quantized(NamedTuple):
     was beyond the amplitude; symbols, how many were sent.
     """
 
-    value: Float[Array, "*n"]
-    error: Float[Array, "*n"]
-    saturated: Bool[Array, "*n"]
-    symbols: Int[Array, "*n"]
+    value: Numbers
+    error: Numbers
+    saturated: Flags
+    symbols: Counts
 
 
 @readable

@@ -99,8 +99,8 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n)."""
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
-    item = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
-    return jnp.einsum("i,ab->aib", item, jnp.eye(n))
+    by_node = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
+    return jnp.einsum("i,ab->aib", by_node, jnp.eye(n))
 
 
 def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) -> Float[jax.Array, "N q"]:

@@ -53,13 +53,13 @@ class HInfinityCertificate(NamedTuple):
 
 
 def certify_level(
-    system: GrowthSystem,
+    system: "GrowthSystem",
     gains: "Float[ArrayLike, 'steps n m']",
     weights: "Float[ArrayLike, 'steps+1 n+n n+n']",
     multipliers: "Float[ArrayLike, 'steps count']",
     level: float,
-    growth: Sequence[GrowthFinding] = (),
-) -> HInfinityCertificate:
+    growth: "Sequence[GrowthFinding]" = (),
+) -> "HInfinityCertificate":
     """Check that gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
 
     Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0 together prove

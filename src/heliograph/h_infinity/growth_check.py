@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
+from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
 from heliograph.numerics.check import array, check_seed, fail, scalar
@@ -21,6 +22,7 @@ SHRINK = 0.8  # of the moves' size from round to round: from half the region to 
 NEARBY = 1e-4  # distance of a close pair, relative to the region's width; closer ones lose digits
 TOLERANCE = 1e-9  # relative excess over the constant that counts as rounding
 
+Pair = TypeAliasType("Pair", tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]])  # two points
 Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with jax.numpy
 
 
@@ -53,7 +55,7 @@ class GrowthFinding(NamedTuple):
     high: Float[np.ndarray, "n"]
     slope: float
     point: Float[np.ndarray, "n"]
-    pair: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
+    pair: Pair
     ratio: float
     at_zero: float
     bound: float | None
@@ -316,11 +318,11 @@ def _sharpened(
             [_bounds(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
         )
         seen += len(bottoms)
-        open_ = bounds > goal
-        done = max(done, float(np.max(bounds[~open_], initial=0.0)))
-        if seen + 2 * np.count_nonzero(open_) > LIMIT:
+        undecided = bounds > goal
+        done = max(done, float(np.max(bounds[~undecided], initial=0.0)))
+        if seen + 2 * np.count_nonzero(undecided) > LIMIT:
             return max(done, float(np.max(bounds)))
-        bottoms, tops = _halved(bottoms[open_], tops[open_], high - low)
+        bottoms, tops = _halved(bottoms[undecided], tops[undecided], high - low)
     return done
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from scipy.sparse import csr_array
+from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.step import (
     Layout,
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from cvxpy import Constraint, Expression, Maximize, Minimize, Parameter, Problem
 
 MARGIN = 1e-7  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
-Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
-Solver = Literal["clarabel", "scs"]
+Objective = TypeAliasType("Objective", Literal["trace", "largest_eigenvalue", "log_determinant", "none"])
+Solver = TypeAliasType("Solver", Literal["clarabel", "scs"])
 TIES = 1e-6, 1e-5, 1e-4  # relative, of a largest eigenvalue that counts as the smallest one: the first that is solved
 SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
@@ -45,10 +46,11 @@ def solvers() -> ModuleType:
     return cvxpy
 
 
-def check_choice(name: str, value: str, choices: object) -> None:
+def check_choice(name: str, value: str, choices: TypeAliasType) -> None:
     """Raise ValueError unless `value` is among a Literal's choices."""
-    if not isinstance(value, str) or value not in get_args(choices):
-        raise fail(name, f"one of {', '.join(get_args(choices))}", shown(value))
+    known = get_args(choices.__value__)
+    if not isinstance(value, str) or value not in known:
+        raise fail(name, f"one of {', '.join(known)}", shown(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:

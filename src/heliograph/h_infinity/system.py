@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
@@ -12,7 +13,10 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.disturbance import DisturbedGain, disturbed_gain
 
-Varying = ArrayLike | OverTime  # the same at all steps, or one for each
+Varying = TypeAliasType("Varying", ArrayLike | OverTime)  # the same at all steps, or one for each
+Constants = TypeAliasType("Constants", Varying | tuple[Varying, Varying])  # of a function, or also of its differences
+Matrices = TypeAliasType("Matrices", Float[np.ndarray, "steps _ _"])
+Moments = TypeAliasType("Moments", tuple[DisturbedGain, ...])  # of the channel at each step
 
 
 @readable
@@ -47,14 +51,14 @@ class GrowthSystem(NamedTuple):
         initial_weight: W (2n, 2n) of the stacked (x_0, e_0), which makes the third disturbance.
     """
 
-    transition: Float[np.ndarray, "steps n n"]
-    disturbance: Float[np.ndarray, "steps n v"]
-    output: Float[np.ndarray, "steps y n"]
-    feedthrough: Float[np.ndarray, "steps y v"]
-    target: Float[np.ndarray, "steps z n"]
+    transition: Matrices
+    disturbance: Matrices
+    output: Matrices
+    feedthrough: Matrices
+    target: Matrices
     growth: Growth
     output_growth: Growth
-    channel: tuple[DisturbedGain, ...]
+    channel: Moments
     initial_weight: Float[np.ndarray, "n+n n+n"]
 
     @property
@@ -79,12 +83,12 @@ def growth_system(
     feedthrough: Varying,
     target: Varying,
     channel: Channel,
-    growth: Varying | tuple[Varying, Varying],
-    output_growth: Varying | tuple[Varying, Varying] = 0.0,
+    growth: Constants,
+    output_growth: Constants = 0.0,
     transition: Varying | None = None,
     output: Varying | None = None,
     initial_weight: "Float[ArrayLike, '...']" = 1.0,
-) -> GrowthSystem:
+) -> "GrowthSystem":
     """Describe x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel, for `steps` steps.
 
     Each matrix may be an `OverTime` of one for every step. A linear h is given by `output` and growth 0.
@@ -136,8 +140,8 @@ def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) 
         return np.broadcast_to(item, (steps, *item.shape))
     if value.steps < steps:
         raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
-    values_: np.ndarray = array(name, value.values, (None, *shape))
-    return values_[:steps]
+    matrices: np.ndarray = array(name, value.values, (None, *shape))
+    return matrices[:steps]
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
@@ -157,7 +161,7 @@ def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
     return links
 
 
-def _growth(steps: int, name: str, value: Varying | tuple[Varying, Varying]) -> Growth:
+def _growth(steps: int, name: str, value: Constants) -> Growth:
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)

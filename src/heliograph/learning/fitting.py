@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.learning.description import Description, describe
 from heliograph.learning.free_marks import Build
@@ -25,7 +26,7 @@ ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the be
 INVISIBLE = 0.01  # information of a logarithm below which its number may as well be the limit
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
-Progress = Callable[[str], None]
+Progress = TypeAliasType("Progress", Callable[[str], None])
 
 
 @readable

@@ -6,6 +6,7 @@ from contextvars import ContextVar
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.learning.likelihood.transforms import to_line
 from heliograph.learning.parameters import Parameter, Parameters
@@ -15,7 +16,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
-Build = Callable[[], Network]
+Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
 from heliograph.numerics.small_matrix import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
@@ -59,6 +59,20 @@ def solve_innovation(innovation: Float[np.ndarray, "m m"], cross: Float[np.ndarr
     return np.asarray((root * inverse) @ (root.T @ cross))
 
 
+def nearest_covariance(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The positive semidefinite matrix nearest to a symmetric one, by its correlation matrix: zero for what is below.
+
+    Of noises that are differences of larger moments, the rounding of these may leave less than nothing.
+    """
+    deviation = np.sqrt(np.maximum(np.diag(a), 0.0))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    values, vectors = np.linalg.eigh(np.where(np.outer(deviation, deviation) > 0, a, 0.0) / np.outer(unit, unit))
+    if values[0] >= -DEFINITENESS_TOLERANCE and np.all(np.diag(a) >= 0):
+        return a
+    root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(root @ root.T)
+
+
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """The best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
 
@@ -84,11 +98,10 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         keep = np.eye(len(spread)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset
-        estimate, claimed = (
-            (projection @ transition, projection @ gain, projection @ offset),
-            projection @ spread @ projection.T,
-        )
-        before = projection @ predicted @ projection.T, s.output @ predicted @ s.output.T + s.noise
+        estimate = projection @ transition, projection @ gain, projection @ offset
+        claimed = nearest_covariance(projection @ spread @ projection.T)
+        innovation = s.output @ predicted @ s.output.T + s.noise
+        before = nearest_covariance(projection @ predicted @ projection.T), innovation
         parts.append((transition, gain, offset, *estimate, *expected, claimed, *before))
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T

@@ -5,6 +5,7 @@ from typing import NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.numerics.check import array, fail, file_path, instance, shown
@@ -12,28 +13,42 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
+Matrices = TypeAliasType("Matrices", Float[np.ndarray, "*time _ _"])  # one for each step; one step: no axis
+Vectors = TypeAliasType("Vectors", Float[np.ndarray, "*time _"])
+
 
 @readable
 class Gains(NamedTuple):
     """Gains of a linear filter, s+ = F s + K z + c and xhat = L s + J z + d with s the state before the step.
 
-    One row per step (one step: no axis). transition F, gain K, offset c, output L, direct J, output_offset d. The
-    prediction of z is G s + g with `expected` G and `expected_offset` g: it replaces what did not arrive. `covariance`
-    is that of x - xhat; `predicted` of x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. The last two
-    are NaN where unknown.
+    The prediction of z is G s + g: it replaces what did not arrive. Every array has a leading axis of time, but for
+    the gains of one step.
+
+    Args:
+        transition: F (time, N, N).
+        gain: K (time, N, m).
+        offset: c (time, N).
+        output: L (time, q, N).
+        direct: J (time, q, m).
+        output_offset: d (time, q).
+        expected: G (time, m, N).
+        expected_offset: g (time, m).
+        covariance: covariance of x - xhat (time, q, q).
+        predicted: covariance of x - L s - J (G s + g) - d, before z (time, q, q); NaN where unknown.
+        innovation: covariance of z - G s - g (time, m, m); NaN where unknown.
     """
 
-    transition: Float[np.ndarray, "*time N N"]
-    gain: Float[np.ndarray, "*time N m"]
-    offset: Float[np.ndarray, "*time N"]
-    output: Float[np.ndarray, "*time q N"]
-    direct: Float[np.ndarray, "*time q m"]
-    output_offset: Float[np.ndarray, "*time q"]
-    expected: Float[np.ndarray, "*time m N"]
-    expected_offset: Float[np.ndarray, "*time m"]
-    covariance: Float[np.ndarray, "*time q q"]
-    predicted: Float[np.ndarray, "*time q q"]
-    innovation: Float[np.ndarray, "*time m m"]
+    transition: Matrices
+    gain: Matrices
+    offset: Vectors
+    output: Matrices
+    direct: Matrices
+    output_offset: Vectors
+    expected: Matrices
+    expected_offset: Vectors
+    covariance: Matrices
+    predicted: Matrices
+    innovation: Matrices
 
 
 PERHAPS = ("predicted", "innovation")  # fields that may be unknown

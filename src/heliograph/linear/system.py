@@ -4,11 +4,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import array, covariance, instance
+from heliograph.numerics import check
+from heliograph.numerics.check import array, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
+
+Rounding = TypeAliasType("Rounding", Float[ArrayLike, "*time _"])  # of the diagonal of a matrix
 
 
 @readable
@@ -37,12 +41,12 @@ class LinearSystem(Module):
     Args:
         steps: matrices of each step.
         mean: mean of y before the first step (N,).
-        covariance_: its covariance (N, N).
+        covariance: its covariance (N, N).
         projection: W (q, N).
         rounding: absolute rounding error of the diagonal of `process` (time, N), where it came out of a subtraction;
             zero unless given, like the next two.
         received_rounding: the same of `noise` (time, m).
-        start_rounding: the same of `covariance_` (N,).
+        start_rounding: the same of `covariance` (N,).
 
     Raises:
         ValueError: shapes that do not fit, or a start that has no covariance.
@@ -60,11 +64,11 @@ class LinearSystem(Module):
         self,
         steps: Steps,
         mean: "Float[ArrayLike, ' N']",
-        covariance_: "Float[ArrayLike, 'N N']",
+        covariance: "Float[ArrayLike, 'N N']",
         projection: "Float[ArrayLike, 'q N']",
-        rounding: "Float[ArrayLike, 'time N'] | None" = None,
-        received_rounding: "Float[ArrayLike, 'time m'] | None" = None,
-        start_rounding: "Float[ArrayLike, ' N'] | None" = None,
+        rounding: Rounding | None = None,
+        received_rounding: Rounding | None = None,
+        start_rounding: Rounding | None = None,
     ):
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
@@ -74,7 +78,7 @@ class LinearSystem(Module):
         checked = [array(f"system {name}", value, (time, *shape)) for name, value, shape in named]
         self.steps = Steps(*checked)
         self.mean = array("mean of the start", mean, (n,))
-        self.covariance = covariance("covariance of the start", covariance_, n)
+        self.covariance = check.covariance("covariance of the start", covariance, n)
         self.projection = array("what is to be known", projection, (None, n))
         self.rounding = _rounding(rounding, (time, n))
         self.received_rounding = _rounding(received_rounding, (time, m))

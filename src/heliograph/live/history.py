@@ -81,7 +81,7 @@ class NetworkStep(Module):
 
     def groups(self, received: jax.Array) -> list[jax.Array]:
         """Return the measurements of each group's nodes, (node, received)."""
-        return [received[np.array(place)] for place in self.places]
+        return [received[np.array(place, dtype=int)] for place in self.places]  # of nodes without a sensor none
 
 
 Replay = Callable[..., tuple[History, list[jax.Array]]]

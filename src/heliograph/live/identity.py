@@ -23,7 +23,7 @@ def versions() -> Identity:
 def network_identity(network: Network, program: str, options: Mapping[str, object]) -> Identity:
     """Return versions, precision, options, names, sizes, hashes of each part's numbers, and a hash of the program."""
     parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
-    parts |= {f"fusion {name!r}": item for name, item in network.fused.items()}
+    parts |= {f"fusion {name!r}": item for name, item in (network.fused | network.meshes).items()}
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
     return {
         **versions(),

@@ -1,6 +1,6 @@
 """Replay of recorded events through a timeline: final estimates, and those of each moment a lag later."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 
@@ -33,13 +33,15 @@ class Played:
 
 
 def play(
-    network: Network, events: Sequence[Event], window: float, lag: float | None = None, start: float = 0.0
+    network: Network, events: Iterable[Event], window: float, lag: float | None = None, start: float = 0.0
 ) -> Played:
     """Push events in order of arrival, and advance the time until all are final.
 
+    A sequence is put in that order; an iterator, which need not fit into memory, has to be in it already.
+
     Args:
         network: the network that the events belong to.
-        events: at least one event, in any order.
+        events: at least one event: a sequence in any order, or an iterator in order of arrival.
         window: how late an event may be, in the unit of time of the network.
         lag: fixed lag of the smoothed estimates, at most `window`; None for no smoothing.
         start: start of continuous time (default 0).
@@ -47,13 +49,11 @@ def play(
     Raises:
         ValueError: no events, a lag beyond the window, and what `Timeline` refuses.
     """
-    if not events:
-        raise fail("events", "at least one", "none")
     if lag is not None and not 0 <= lag <= window:
         raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
     timeline = Timeline(network, window, start)
     # Order of arrival; without an arrival time an event arrives when it is measured.
-    coming = sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
+    coming = sorted(events, key=_arrival) if isinstance(events, Sequence) else events
     finals: list[Record] = []
     lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
     waiting: list[float] = []  # moments of which the lag has not passed
@@ -68,18 +68,25 @@ def play(
             lagged.append((moment, timeline.lagged(min(timeline.now - moment, window))))
 
     # Final estimates are collected before the timeline would drop any.
-    for i, event in enumerate(coming):
-        look(event.time if event.arrival is None else event.arrival)
+    count = 0
+    for count, event in enumerate(coming, 1):
+        look(_arrival(event))
         if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
             heappush(waiting, event.time)
-        if (i + 1) % timeline.capacity == 0:
+        if count % timeline.capacity == 0:
             finals.append(timeline.final())
+    if not count:
+        raise fail("events", "at least one", "none")
     look(np.inf)
     # The rest becomes final.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
     late = None if lag is None else _record(network, lagged)
     return Played(_joined(finals), late, timeline.counts, timeline.forced)
+
+
+def _arrival(event: Event) -> float:
+    return event.time if event.arrival is None else event.arrival
 
 
 def _joined(parts: Sequence[Record]) -> Record:

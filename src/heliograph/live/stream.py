@@ -30,7 +30,7 @@ class Stream:
     does not support the filter. Measurements that would spoil the state are refused (`push`).
 
     Args:
-        filter_: the filter to run.
+        filter: the filter to run.
         limits: greatest and smallest plausible values, as of a `Node`; numbers beyond them count as not arrived, and
             `dropped` counts them by component.
         invalid: codes for a missing value, as of a `Node`.
@@ -39,14 +39,14 @@ class Stream:
         ValueError: no filter, or invalid limits.
     """
 
-    def __init__(self, filter_: AbstractFilter, limits: LimitsLike = None, invalid: ArrayLike = ()):
-        if not isinstance(filter_, AbstractFilter):
-            raise fail("stream", "a filter", type(filter_).__name__)
-        self.filter = filter_
-        self.limits = limits_of(filter_.received, limits, invalid)
-        self.dropped = np.zeros(filter_.received, dtype=np.int64)
+    def __init__(self, filter: AbstractFilter, limits: LimitsLike = None, invalid: ArrayLike = ()):
+        if not isinstance(filter, AbstractFilter):
+            raise fail("stream", "a filter", type(filter).__name__)
+        self.filter = filter
+        self.limits = limits_of(filter.received, limits, invalid)
+        self.dropped = np.zeros(filter.received, dtype=np.int64)
         self.steps = 0
-        self._placed = _place(filter_)
+        self._placed = _place(filter)
         self._stepper = self._placed.stepper()
 
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> Estimate:
@@ -109,10 +109,10 @@ class Stream:
 
     @classmethod
     def restore(
-        cls, filter_: AbstractFilter, data: bytes, limits: LimitsLike = None, invalid: ArrayLike = ()
+        cls, filter: AbstractFilter, data: bytes, limits: LimitsLike = None, invalid: ArrayLike = ()
     ) -> "Stream":
         """Restore a saved stream of the same filter; `limits` and `invalid` hold from here on."""
-        new, (head, arrays) = cls(filter_, limits, invalid), unpacked(data)
+        new, (head, arrays) = cls(filter, limits, invalid), unpacked(data)
         check_same("snapshot", new._placed.identity, head.get("of", {}))
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
         new._stepper.put([arrays[f"state.{i}"] for i in range(len(new._stepper.state))])
@@ -145,14 +145,14 @@ def _row(value: object, length: int) -> np.ndarray | None:
 class _Placed:
     """A compiled filter with its arrays, shared by all streams of the filter."""
 
-    def __init__(self, filter_: AbstractFilter):
-        self.filter, self.horizon = filter_, filter_.horizon
-        self.received, self.given = filter_.received, len(filter_.inputs)
+    def __init__(self, filter: AbstractFilter):
+        self.filter, self.horizon = filter, filter.horizon
+        self.received, self.given = filter.received, len(filter.inputs)
         with jax.enable_x64(True):
-            self.numbers, self._static = cast(filter_)
-            self._start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
+            self.numbers, self._static = cast(filter)
+            self._start: PyTree = jax.tree.map(jnp.asarray, filter.init())
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
-        self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
+        self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter.claim))
 
     def stepper(self) -> NativeStepper | XlaStepper:
         """Return a stepper at the prior."""
@@ -183,8 +183,8 @@ class _Placed:
 _SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id of a filter, which its entry keeps
 
 
-def _place(filter_: AbstractFilter) -> _Placed:
-    result = _SHARED.get(id(filter_))
+def _place(filter: AbstractFilter) -> _Placed:
+    result = _SHARED.get(id(filter))
     if result is None:
-        result = _SHARED[id(filter_)] = _Placed(filter_)
+        result = _SHARED[id(filter)] = _Placed(filter)
     return result

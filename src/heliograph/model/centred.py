@@ -97,5 +97,5 @@ def _along(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inp
         return x, senses.measure(x) + senses.noise.mean
 
     start = jnp.asarray(at(plant, 0).initial_mean)
-    result: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
-    return result
+    expected: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+    return expected

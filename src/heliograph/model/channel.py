@@ -17,16 +17,16 @@ from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.in_line import in_series
-from heliograph.random_affine.law import AbstractLaw, Constant
-from heliograph.random_affine.noise import AbstractNoise, as_noise, components
+from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
 @overload
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
@@ -34,8 +34,8 @@ def hop(
 ) -> GainAndNoise: ...
 @overload
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
@@ -45,8 +45,8 @@ def hop(
 
 
 def hop(
-    gain: AbstractLaw | ArrayLike,
-    noise: AbstractNoise | ArrayLike,
+    gain: LawLike,
+    noise: NoiseLike,
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
@@ -66,8 +66,8 @@ def hop(
     count = components(noise) or check_count("dimension of a hop", dimension)
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
-    result = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
-    return result if delay is None else Delayed(result, delay)
+    radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
+    return radio_hop if delay is None else Delayed(radio_hop, delay)
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:

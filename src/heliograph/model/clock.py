@@ -47,11 +47,11 @@ class Stamped(AbstractSensor):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x) - o dh/dt; h(x) where the clock is right."""
-        local = jnp.asarray(x)[: self.states]
+        state = jnp.asarray(x)[: self.states]
         if self.motion is None:
-            return self.base.measure(local)
-        rate = jnp.asarray(self.motion(local) if callable(self.motion) else jnp.asarray(self.motion) @ local)
-        y, change = jax.jvp(self.base.measure, (local,), (rate,))
+            return self.base.measure(state)
+        rate = jnp.asarray(self.motion(state) if callable(self.motion) else jnp.asarray(self.motion) @ state)
+        y, change = jax.jvp(self.base.measure, (state,), (rate,))
         return jnp.asarray(y - x[self.offset] * change)
 
 
@@ -74,12 +74,12 @@ class Clocked(AbstractPlant):
 
 
 def with_clocks(
-    plant: AbstractPlant,
-    sensors: Mapping[str, AbstractSensor],
-    clocks: Mapping[str, Clock],
+    plant: "AbstractPlant",
+    sensors: "Mapping[str, AbstractSensor]",
+    clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
     dt: "Float[ArrayLike, '']",
-) -> tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]:
+) -> "tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The

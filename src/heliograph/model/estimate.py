@@ -53,10 +53,10 @@ class Innovation(Module):
             weighs them; None of all others.
     """
 
-    value: Float[Array, "... m"]
-    covariance: Float[Array, "... m m"]
-    log_likelihood: Float[Array, "..."]
-    weight: Float[Array, "... m"] | None = None
+    value: "Float[Array, '... m']"
+    covariance: "Float[Array, '... m m']"
+    log_likelihood: "Float[Array, '...']"
+    weight: "Float[Array, '... m'] | None" = None
 
 
 def weakest(claims: list[Claim]) -> Claim:
@@ -83,12 +83,15 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
     unit = own_units(safe)
     correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
-    result: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
-    return result
+    sound: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
+    return sound
 
 
 def with_sound_claim(estimate: Estimate) -> Estimate:
-    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none."""
-    if estimate.claim == "none" or is_sound(estimate).all():
+    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none.
+
+    Several keep theirs: `claims` says of which it holds.
+    """
+    if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or is_sound(estimate).all():
         return estimate
     return Estimate(estimate.mean, estimate.covariance, "none")

@@ -26,7 +26,7 @@ from heliograph.random_affine.modes import (
     laws,
     mixed,
 )
-from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, as_noise, components
+from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, components
 
 
 def gilbert_elliott(
@@ -53,7 +53,7 @@ def gilbert_elliott(
 def markov_fading(
     gains: Sequence[AbstractRandomAffine] | ArrayLike,
     transition: MarkovChain | ArrayLike,
-    noise: AbstractNoise | ArrayLike | None = None,
+    noise: NoiseLike | None = None,
     name: str | None = None,
 ) -> Modes:
     """A link whose gain moves as a Markov chain: `gains` are numbers, with one `noise`, or a channel for each mode.
@@ -81,7 +81,7 @@ def autoregressive_fading(
     mean: Float[ArrayLike, ""],
     deviation: Float[ArrayLike, ""],
     correlation: Float[ArrayLike, ""],
-    noise: AbstractNoise | Float[ArrayLike, "*m"],
+    noise: NoiseLike,
     dimension: int = 1,
     name: str | None = None,
 ) -> Faded:

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
-LimitsLike = ArrayLike | Sequence[Sequence[float | None]] | None
+LimitsLike = TypeAliasType("LimitsLike", ArrayLike | Sequence[Sequence[float | None]] | None)
 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
@@ -64,10 +65,10 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
         raise fail("limits", expected, shown(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
     pairs = [[end if item is None else item for item, end in zip(row, everything, strict=True)] for row in rows]
-    result = _numbers("limits", pairs, expected)
-    if np.any(~(result[:, 0] < result[:, 1])):
+    intervals = _numbers("limits", pairs, expected)
+    if np.any(~(intervals[:, 0] < intervals[:, 1])):
         raise fail("limits", "a low end below the high one", shown(limits))
-    return result
+    return intervals
 
 
 def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:

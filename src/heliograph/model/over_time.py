@@ -59,8 +59,8 @@ def stack(items: Sequence[T]) -> T:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     pieces = zip(*(leaves for leaves, _ in flat), strict=True)
     stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
-    result: T = jax.tree.unflatten(flat[0][1], stacked)
-    return result
+    steps_of_parts: T = jax.tree.unflatten(flat[0][1], stacked)
+    return steps_of_parts
 
 
 def structure(item: object) -> Hashable:

@@ -21,6 +21,7 @@ from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.noise import (
     AbstractNoise,
     Matrix,
+    NoiseLike,
     Square,
     Vector,
     as_noise,
@@ -28,7 +29,8 @@ from heliograph.random_affine.noise import (
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 A = TypeVar("A", jax.Array, np.ndarray)
-NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), from the input u
+TransitionFunction = TypeAliasType("TransitionFunction", Callable[[jax.Array, jax.Array], ArrayLike])  # f(x, u)
+NoiseFunction = TypeAliasType("NoiseFunction", Callable[[jax.Array], ArrayLike])  # Cov w (n, n) of the input u
 
 
 @readable
@@ -117,10 +119,10 @@ class Plant(AbstractPlant):
 
     def __init__(
         self,
-        transition: Callable[[jax.Array, jax.Array], ArrayLike],
-        noise: AbstractNoise | ArrayLike | NoiseFunction,
+        transition: TransitionFunction,
+        noise: NoiseLike | NoiseFunction,
         initial_mean: ArrayLike,
-        initial_covariance: AbstractNoise | ArrayLike,
+        initial_covariance: NoiseLike,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
         circular: Sequence[str] = (),
@@ -171,9 +173,9 @@ class LinearPlant(AbstractPlant):
     def __init__(
         self,
         matrix: ArrayLike | MatrixFunction,
-        noise: AbstractNoise | ArrayLike | NoiseFunction,
+        noise: NoiseLike | NoiseFunction,
         initial_mean: ArrayLike,
-        initial_covariance: AbstractNoise | ArrayLike,
+        initial_covariance: NoiseLike,
         input_matrix: ArrayLike | MatrixFunction | None = None,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
@@ -241,7 +243,7 @@ def check_turns(
                            f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
 
 
-def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector, Square, AbstractNoise | None]:
+def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, AbstractNoise | None]:
     """Mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]

@@ -254,4 +254,4 @@ def _check_reached(network: RelayNetwork, name: str) -> None:
         raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")
     if not received - {name}:
         got = "itself only" if received else "nobody"
-        raise fail(f"relay {name!r}", "to hear the sensor or another relay in some slot", got)
+        raise fail(f"relay {name!r}", "to receive the sensor or another relay in some slot", got)

@@ -17,7 +17,7 @@ from heliograph.numerics.check import array, fail, function, instance, items, na
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.noise import AbstractNoise, as_noise, components
+from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 
 @readable
@@ -78,7 +78,7 @@ class Sensor(AbstractSensor):
     def __init__(
         self,
         measure: Callable[[jax.Array], ArrayLike],
-        noise: AbstractNoise | ArrayLike,
+        noise: NoiseLike,
         outputs: Sequence[str] | None = None,
         circular: Sequence[str] = (),
     ):
@@ -110,7 +110,7 @@ class LinearSensor(AbstractSensor):
     def __init__(
         self,
         matrix: ArrayLike,
-        noise: AbstractNoise | ArrayLike,
+        noise: NoiseLike,
         outputs: Sequence[str] | None = None,
         circular: Sequence[str] = (),
     ):

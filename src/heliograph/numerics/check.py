@@ -260,8 +260,8 @@ def own_units(matrix: np.ndarray) -> np.ndarray:
     """
     diagonal = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
     others = np.where(diagonal > 0, diagonal, np.inf)
-    others_ = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
-    return np.asarray(np.where(diagonal > 0, diagonal, np.where(others_ > 0, others_, 1.0)))
+    largest = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
+    return np.asarray(np.where(diagonal > 0, diagonal, np.where(largest > 0, largest, 1.0)))
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:

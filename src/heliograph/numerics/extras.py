@@ -32,6 +32,8 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "paho": "live",
     "nats": "live",
     "psycopg": "postgres",
+    "rosbags": "bags",
+    "asyncua": "opcua",
 }
 
 

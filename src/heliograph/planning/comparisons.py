@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import amplify_and_forward
 from heliograph.numerics.check import array, fail, function, instance
@@ -22,7 +23,7 @@ from heliograph.simulation.node import Node
 SPAN, POINTS = 10.0, 9  # of the totals that are tried about a design's: down and up by this factor, so many
 SITE_STARTS, CHANGE_STARTS = 8, 16  # descents at each place, and after each change: compared, not built
 
-Advance = Callable[[str], None]
+Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
 def _silent(what: str) -> None:
@@ -88,12 +89,12 @@ class SiteMap(NamedTuple):
 
 
 def error_over_sites(
-    best: PowerDesign,
-    build: Callable[[float, float], Network],
+    best: "PowerDesign",
+    build: "Callable[[float, float], Network]",
     x: "Float[ArrayLike, ' columns']",
     y: "Float[ArrayLike, ' rows']",
     advance: Advance = _silent,
-) -> SiteMap:
+) -> "SiteMap":
     """Least error at a design's total power, with its network standing elsewhere.
 
     Args:

@@ -116,16 +116,16 @@ class PowerDesign(Module):
     function of them. realised: the network at these numbers, None where powers alone were designed.
     """
 
-    problem: DesignProblem
-    powers: dict[str, Float[np.ndarray, "steps"]]
+    problem: "DesignProblem"
+    powers: "dict[str, Float[np.ndarray, 'steps']]"
     error: float
-    certificate: Certificate
+    certificate: "Certificate"
     present: float
-    covariance: Float[np.ndarray, "steps n n"]
+    covariance: "Float[np.ndarray, 'steps n n']"
     sensitivity: dict[str, float]
     price: float
     numbers: dict[str, np.ndarray]
-    realised: Network | None
+    realised: "Network | None"
 
     @property
     def bound(self) -> float:

@@ -221,7 +221,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
     """Power of each transmitter where the channel's modes have this law (one mode, of a channel without memory)."""
     total: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
     occurs = dict(total)
-    for weight, map_ in zip(law, joint_modes(channel, order=2).maps, strict=True):
+    for weight, mode_map in zip(law, joint_modes(channel, order=2).maps, strict=True):
         # Powers in a mode; a transmitter that is not received there sends as in other modes.
         powers: dict[str, Scalar] = {}
 
@@ -231,7 +231,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
             return hop
 
-        visit_hops(map_, note, Signal(second, 1.0))
+        visit_hops(mode_map, note, Signal(second, 1.0))
         for name, power in powers.items():
             total[name] += weight * power
             occurs[name] += weight

@@ -99,8 +99,8 @@ class GainAndNoise(AbstractRandomAffine):
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
         """Return the moments with E[g^k] of each extreme law."""
         gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
-        result: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
-        return result
+        moment_map: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
+        return moment_map
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Return the map E[g] A y + n."""

@@ -294,8 +294,8 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
     def chosen(part: PyTree) -> PyTree:
         return part.given(by_identity[part.memory.identity]) if _is_modal(part) else part
 
-    result: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
-    return result
+    memoryless: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
+    return memoryless
 
 
 def anonymous(channel: T) -> T:
@@ -345,13 +345,13 @@ def _is_modal(item: object) -> bool:
 
 def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
     """Check that `maps` is a sequence of at least one random affine map, and return it as a tuple."""
-    result = tuple(items(name, maps, "random affine maps"))
-    if not result:
+    checked = tuple(items(name, maps, "random affine maps"))
+    if not checked:
         raise fail(name, "at least one map", "none")
-    for item in result:
+    for item in checked:
         if not isinstance(item, AbstractRandomAffine):
             raise fail(name, "random affine maps (hops, and maps made of them)", shown(item))
-    return result
+    return checked
 
 
 def check_forgets(name: str, channel: AbstractRandomAffine) -> None:

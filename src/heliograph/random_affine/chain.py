@@ -225,8 +225,8 @@ def stationary(transition: Rows) -> Law:
         raise fail("initial law", "one, since the chain has several stationary laws", "none")
     balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
     law = xp.linalg.solve(balance, np.eye(m)[-1])
-    result: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
-    return result
+    normalised: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
+    return normalised
 
 
 def _identity(name: str | None) -> str:
@@ -245,8 +245,8 @@ def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     """Probabilities of 0, ..., n successes."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)
-    result: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
-    return result
+    binomial: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
+    return binomial
 
 
 @cache

@@ -181,8 +181,8 @@ class Mixture(AbstractOfOneShape, _Parts):
         chosen = np.array(list(product(*(range(len(part)) for part in parts)))).T
         combined = stacked([part[item] for part, item in zip(parts, chosen, strict=True)])
         items = library(weights, combined).tensordot(weights, combined, axes=1)
-        result: Matrix = items.reshape(-1, *items.shape[2:])
-        return result
+        flat: Matrix = items.reshape(-1, *items.shape[2:])
+        return flat
 
     def corner_count(self) -> int:
         """Extreme weights times the product of the maps' counts."""
@@ -199,7 +199,7 @@ class Mixture(AbstractOfOneShape, _Parts):
 
 
 class Stack(_Parts):
-    """Independent maps that hear the same y, their outputs one above the other; moments are products of polynomials."""
+    """Stack of independent maps of the same y, outputs one above the other; moments are products of polynomials."""
 
     maps: tuple[AbstractRandomAffine, ...]
 
@@ -236,7 +236,7 @@ class Stack(_Parts):
 
     def _row(self, powers: tuple[int, ...], tables: list[list[Matrix | None]]) -> Vector:
         variables, start = self.inputs + 1, 0
-        result: Vector = np.ones(1)
+        coefficients: Vector = np.ones(1)
         degree = 0
         for m, table in zip(self.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
@@ -245,11 +245,11 @@ class Stack(_Parts):
             part = table[k]
             if part is not None:
                 polynomial = part[position(m.outputs + 1, k)[(*a, 0)]]
-                result, degree = multiply(result, degree, polynomial, k, variables), degree + k
+                coefficients, degree = multiply(coefficients, degree, polynomial, k, variables), degree + k
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)
-        result = multiply(result, degree, constant, powers[-1], variables)
-        return result
+        coefficients = multiply(coefficients, degree, constant, powers[-1], variables)
+        return coefficients
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """All combinations of the parts' extremes."""

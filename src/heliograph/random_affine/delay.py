@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PyTree
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.random_affine.atoms import GainAndNoise, known
@@ -16,7 +17,8 @@ from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.moments import Moments
 
-Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain whose mode is the number of steps
+# Steps; their law at each step; or a chain whose mode is the number of steps.
+Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
 T = TypeVar("T")
 
 
@@ -149,8 +151,8 @@ def of_line(channel: T) -> T:
     def plain(part: object) -> object:
         return part.line if isinstance(part, AbstractOfLine) else part
 
-    result: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
-    return result
+    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
+    return without_line
 
 
 def sent(channel: AbstractRandomAffine) -> int:

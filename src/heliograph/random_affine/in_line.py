@@ -77,10 +77,10 @@ class Relayed(AbstractOfLine):
     @property
     def line(self) -> AbstractRandomAffine:
         """Return the stages in series, each fed by the storage of the one before."""
-        size, result = sent(self.stages[0]), of_line(self.stages[0])
+        size, whole = sent(self.stages[0]), of_line(self.stages[0])
         for stage in self.stages[1:]:
-            result = Series([Held(result, size, stage.past), of_line(stage)])
-        return result
+            whole = Series([Held(whole, size, stage.past), of_line(stage)])
+        return whole
 
     @property
     def past(self) -> int:
@@ -105,7 +105,7 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     stages: list[list[AbstractRandomAffine]] = [[links[0]]]
     for link in links[1:]:
         if link.past and not isinstance(link, Delayed):
-            raise fail("series", "links that are late each by itself", "a combination of late links")
+            raise fail("series", "links each delayed by itself", "a combination of delayed links")
         if isinstance(link, Delayed) and not link.constant:
             stages.append([link])
         else:
@@ -124,7 +124,7 @@ def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     if not delays:
         return Series(links)
     if links[0].past and not isinstance(links[0], Delayed):
-        raise fail("series", "links that are late each by itself", "a combination of late links")
+        raise fail("series", "links each delayed by itself", "a combination of delayed links")
     # The random delay comes first; constant ones are added to it.
     start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
     timestamped = [link.timestamped for link in delays]

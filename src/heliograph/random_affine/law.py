@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from typing_extensions import TypeAliasType
 
+from heliograph.numerics import check
 from heliograph.numerics.caching import cached
-from heliograph.numerics.check import array, fail, probabilities, radii, scalar
+from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
@@ -54,6 +56,9 @@ class AbstractLaw(Module):
         return Constant(self.moment(1))
 
 
+LawLike = TypeAliasType("LawLike", AbstractLaw | ArrayLike)  # a law, or a gain that is certain
+
+
 class Constant(AbstractLaw):
     """A gain that is always `value`."""
 
@@ -78,9 +83,9 @@ class Discrete(AbstractLaw):
     probabilities: Vector
     radius: np.ndarray
 
-    def __init__(self, values: ArrayLike, probabilities_: ArrayLike, radius: ArrayLike = 0.0):
+    def __init__(self, values: ArrayLike, probabilities: ArrayLike, radius: ArrayLike = 0.0):
         self.values = array("gain values", values, (None,))
-        self.probabilities = probabilities("gain probabilities", probabilities_, len(self.values))
+        self.probabilities = check.probabilities("gain probabilities", probabilities, len(self.values))
         self.radius = radii("probability radius", radius, self.probabilities)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -215,8 +220,8 @@ def _laguerre(order: int, x: Scalar) -> Scalar:
         before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
     while v < order / 2:
         before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
-    result: Scalar = now
-    return result
+    moment: Scalar = now
+    return moment
 
 
 class Nakagami(AbstractLaw):

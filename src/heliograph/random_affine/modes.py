@@ -68,8 +68,8 @@ class Modes(AbstractOfOneShape, AbstractModal):
         if len(set(trees)) > 1 or len(shapes) > 1:
             return _Chosen(self.maps, jnp.asarray(state))
         numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
-        result: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
-        return result
+        present: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
+        return present
 
 
 class _Chosen(AbstractOfOneShape):

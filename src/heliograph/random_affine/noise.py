@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import array, covariance, fail, instance, items, probabilities, shown
+from heliograph.numerics import check
+from heliograph.numerics.check import array, fail, instance, items, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
@@ -63,8 +65,8 @@ class Gaussian(AbstractNoise):
     mean: Vector
     factor: Square  # A with A A' = covariance; its columns are eigenvectors, or of Cholesky's factor where it is traced
 
-    def __init__(self, covariance_: ArrayLike, mean: ArrayLike | None = None):
-        self.covariance = covariance("noise covariance", covariance_)
+    def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
+        self.covariance = check.covariance("noise covariance", covariance)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
@@ -95,14 +97,14 @@ class Gaussian(AbstractNoise):
         return expectation(tuple(powers))
 
 
-def _root(covariance_: Square) -> np.ndarray:
+def _root(covariance: Square) -> np.ndarray:
     """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
     eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
     have none.
     """
-    matrix = np.asarray(covariance_)
+    matrix = np.asarray(covariance)
     deviation = np.sqrt(np.diagonal(matrix))
     unit = np.where(deviation > 0, deviation, 1.0)
     for scale in (np.ones_like(unit), unit):
@@ -119,7 +121,7 @@ class FiniteSupport(AbstractNoise):
 
     Args:
         atoms: the values (atom, component).
-        probabilities_: their probabilities (atom,).
+        probabilities: their probabilities (atom,).
     """
 
     atoms: Matrix
@@ -127,9 +129,9 @@ class FiniteSupport(AbstractNoise):
     mean: Vector
     covariance: Square
 
-    def __init__(self, atoms: "Float[ArrayLike, 'atom component']", probabilities_: "Float[ArrayLike, ' atom']"):
+    def __init__(self, atoms: "Float[ArrayLike, 'atom component']", probabilities: "Float[ArrayLike, ' atom']"):
         self.atoms = array("noise atoms", atoms, (None, None))
-        self.probabilities = probabilities("noise probabilities", probabilities_, len(self.atoms))
+        self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
         centred = self.atoms - self.mean
         self.covariance = centred.T @ (self.probabilities[:, None] * centred)
@@ -172,9 +174,9 @@ class Independent(AbstractNoise):
         value: Number = 1.0
         start = 0
         for part in self.parts:
-            local = tuple(powers[start : start + part.dimension])
+            part_powers = tuple(powers[start : start + part.dimension])
             start += part.dimension
-            value *= part.moment(local) if any(local) else 1.0
+            value *= part.moment(part_powers) if any(part_powers) else 1.0
         return value
 
 
@@ -214,15 +216,18 @@ class Shaped(AbstractNoise):
 
 def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
     """Coefficients of p(u) sum_j row_j u_j."""
-    result: dict[Exponents, Number] = {}
+    raised_polynomial: dict[Exponents, Number] = {}
     for a, c in polynomial.items():
         for j in (j for j, entry in enumerate(row) if not is_zero(entry)):
             raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            result[raised] = result.get(raised, 0.0) + c * plain(row[j])
-    return result
+            raised_polynomial[raised] = raised_polynomial.get(raised, 0.0) + c * plain(row[j])
+    return raised_polynomial
 
 
-def as_noise(name: str, value: AbstractNoise | ArrayLike, dimension: int) -> AbstractNoise:
+NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance
+
+
+def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
     """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise.
 
     Raises:
@@ -232,13 +237,13 @@ def as_noise(name: str, value: AbstractNoise | ArrayLike, dimension: int) -> Abs
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)
     if not isinstance(value, AbstractNoise):
-        return Gaussian(covariance(name, value, dimension))
+        return Gaussian(check.covariance(name, value, dimension))
     if value.dimension != dimension:
         raise fail(name, f"a noise of dimension {dimension}", f"dimension {value.dimension}")
     return value
 
 
-def components(value: AbstractNoise | ArrayLike) -> int | None:
+def components(value: NoiseLike) -> int | None:
     """Return the number of components of a noise law or covariance; None for a number, which is a variance alone."""
     if isinstance(value, AbstractNoise):
         return value.dimension

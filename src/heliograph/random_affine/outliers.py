@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar
+from heliograph.numerics import check
+from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
 
@@ -41,7 +42,7 @@ class StudentT(AbstractNoise):
     mean: Vector
 
     def __init__(self, scale: ArrayLike, degrees: ArrayLike):
-        self.scale = covariance("scale of Student's law", scale, _size(scale))
+        self.scale = check.covariance("scale of Student's law", scale, _size(scale))
         self.degrees = scalar("degrees of Student's law", degrees, TINY)
         self.mean = np.zeros(self.scale.shape[-1])
 
@@ -56,8 +57,8 @@ class StudentT(AbstractNoise):
         if not is_traced(nu) and nu <= 2:
             expected = "more than 2, below which it has no covariance (robust_filter with its score update needs none)"
             raise fail("degrees of Student's law", expected, f"{float(nu):g}")
-        result: Square = self.scale * (nu / (nu - 2))
-        return result
+        total: Square = self.scale * (nu / (nu - 2))
+        return total
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw A w / sqrt(l), w standard normal."""
@@ -106,14 +107,14 @@ class Contaminated(AbstractNoise):
     covariance: Square
     bounded: bool = eqx.field(static=True)
 
-    def __init__(self, covariance_: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
-        inlier = covariance("covariance of contaminated noise", covariance_, _size(covariance_))
+    def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
         parts, several = _shares(share)
         outliers = _several("covariance of the outliers", outlier_covariance, len(parts), several)
         biases = _several("bias of the outliers", bias, len(parts), several)
         xp = library(inlier, parts, outliers, biases)
-        spreads = [covariance("covariance of the outliers", r, n) for r in outliers]
+        spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
                    for b in biases]  # fmt: skip
         # The first branch is the noise without outliers; the moments are those of the mixture.
@@ -126,7 +127,7 @@ class Contaminated(AbstractNoise):
         self.bounded = False
 
     @classmethod
-    def one_sided(cls, covariance_: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
+    def one_sided(cls, covariance: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
         """Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
 
         The exponential law as `slices` of equal probability, each with its mean and variance: the mean and the variance
@@ -136,7 +137,7 @@ class Contaminated(AbstractNoise):
             ValueError: as for the class; no slice.
         """
         count = check_count("slices of an exponential bias", slices)
-        inlier = covariance("covariance of contaminated noise", covariance_, _size(covariance_))
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
         n = inlier.shape[-1]
         factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
         center, variance = _exponential_slices(count)
@@ -147,7 +148,7 @@ class Contaminated(AbstractNoise):
         return cls(inlier, [part] * count, spreads, [m * units for m in center])
 
     @classmethod
-    def at_most(cls, covariance_: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
+    def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
         """Noise of mean zero of which bounds are known: at most this share of outliers, E[o o'] at most this matrix.
 
         (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
@@ -155,7 +156,7 @@ class Contaminated(AbstractNoise):
         Raises:
             ValueError: as for the class; a second moment of outliers that does not dominate the covariance.
         """
-        law = cls(covariance_, share, outlier_second_moment)
+        law = cls(covariance, share, outlier_second_moment)
         if not is_traced(law.covariances):
             least = np.min(np.linalg.eigvalsh(law.covariances[1] - law.covariances[0]))
             if least < -1e-10 * np.max(np.abs(law.covariances[1])):
@@ -218,8 +219,8 @@ def precision_shares(degrees: ArrayLike) -> Vector:
     below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half, between.shape), between * half)
     masses = xp.diff(xp.concatenate([np.zeros(1), below, np.ones(1)]))
     masses = xp.maximum(masses, LEAST_SHARE)
-    result: Vector = masses / xp.sum(masses)
-    return result
+    shares: Vector = masses / xp.sum(masses)
+    return shares
 
 
 class Nominal(NamedTuple):
@@ -301,8 +302,8 @@ def _log(value: Vector) -> Vector:
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):
-        result: Vector = np.log(np.maximum(value, 0.0))
-    return result
+        logarithm: Vector = np.log(np.maximum(value, 0.0))
+    return logarithm
 
 
 def _stacked(parts: list[Branches]) -> Branches:

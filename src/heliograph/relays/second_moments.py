@@ -131,7 +131,7 @@ def propagate_own(steps: Steps, start: Float[Array, "d d"]) -> Propagated:
 
 
 def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> Propagated:
-    """Given gains; entries of rows that hear nothing are not used."""
+    """Given gains; entries of rows that receive nothing are not used."""
 
     def single(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = item

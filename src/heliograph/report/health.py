@@ -37,7 +37,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Listening:
+class FilterHealth:
     """Innovations of one filter in units of its claim (time, m), and the test of their whiteness.
 
     Both are None for a filter without a claim, the test also if there are too few rows.
@@ -56,7 +56,7 @@ class Health:
 
     record: Record
     links: list[Link]
-    filters: list[Listening]
+    filters: list[FilterHealth]
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
 
     def warnings(self) -> list[str]:
@@ -70,12 +70,12 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
-        for filter_ in self.filters:
-            lines += _doubts(filter_)
+        for tested_filter in self.filters:
+            lines += _doubts(tested_filter)
         return lines
 
 
-def _doubts(item: Listening) -> Iterator[str]:
+def _doubts(item: FilterHealth) -> Iterator[str]:
     if item.test is None:
         return
     name, test = f"{item.node}/{item.filter}", item.test
@@ -114,7 +114,7 @@ def examine(
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
-        filters.append(Listening(node, name, "none" if lost else item.claim, white, test))
+        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test))
     return Health(record, links, filters, network.shared)
 
 

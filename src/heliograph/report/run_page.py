@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
-from heliograph.report.health import Health, Listening
+from heliograph.report.health import FilterHealth, Health
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.results.record import Record
@@ -46,8 +46,8 @@ def _nodes(record: Record) -> list[str]:
     return [node for node, filters in record.estimates.items() if filters][:MOST]
 
 
-def _tested(health: Health) -> list[Listening]:
-    return [filter_ for filter_ in health.filters if filter_.white is not None][:MOST]
+def _tested(health: Health) -> list[FilterHealth]:
+    return [tested_filter for tested_filter in health.filters if tested_filter.white is not None][:MOST]
 
 
 @matplotlib.rc_context(LOOK)
@@ -61,7 +61,7 @@ def _estimates(health: Health, record: Record, node: str) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
-def _innovations(health: Health, tested: list[Listening]) -> Figure:
+def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
     for axes, item in zip(grid, tested, strict=True):
@@ -107,7 +107,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
         KeyFigure(
-            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could hear", GREEN
+            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could receive", GREEN
         ),
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
@@ -153,7 +153,7 @@ def errors_table(record: Record) -> list[Table]:
 def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
         return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
-    tested = any(filter_.test is not None for filter_ in health.filters)
+    tested = any(tested_filter.test is not None for tested_filter in health.filters)
     result = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
     return f"Nothing is lost that the network says cannot be lost, and {result}."
 
@@ -175,16 +175,16 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
     # One row for each filter: size, correlation and p-value of its innovations.
     rows = []
-    for filter_ in health.filters:
-        test, name = filter_.test, visible(f"{filter_.node}/{filter_.filter}")
+    for tested_filter in health.filters:
+        test, name = tested_filter.test, visible(f"{tested_filter.node}/{tested_filter.filter}")
         if test is None:
-            rows.append([name, filter_.claim, "–", "–", "–"])
+            rows.append([name, tested_filter.claim, "–", "–", "–"])
         else:
             size = f"{test.power:.2f} ± {1.96 * test.power_error:.2f}"
             rows.append(
                 [
                     name,
-                    filter_.claim,
+                    tested_filter.claim,
                     size,
                     f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
                     f"{test.p_value:.3f}",
@@ -230,16 +230,16 @@ def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
 def run_summary(health: Health) -> dict[str, Json]:
     """Return all numbers of the report, by node and filter, and by node and component."""
     filters: dict[str, dict[str, Json]] = {}
-    for filter_ in health.filters:
-        results: dict[str, Json] = {"claim": filter_.claim}
-        if filter_.test is not None:
+    for tested_filter in health.filters:
+        results: dict[str, Json] = {"claim": tested_filter.claim}
+        if tested_filter.test is not None:
             results |= {
-                "size": filter_.test.power,
-                "size_error": filter_.test.power_error,
-                "correlation": float(filter_.test.correlation[0]),
-                "p_value": filter_.test.p_value,
+                "size": tested_filter.test.power,
+                "size_error": tested_filter.test.power_error,
+                "correlation": float(tested_filter.test.correlation[0]),
+                "p_value": tested_filter.test.p_value,
             }
-        filters.setdefault(filter_.node, {})[filter_.filter] = results
+        filters.setdefault(tested_filter.node, {})[tested_filter.filter] = results
     # Errors, where the truth is known.
     errors: dict[str, dict[str, Json]] = {}
     for item in errors_of(health.record):

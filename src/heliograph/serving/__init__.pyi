@@ -14,6 +14,10 @@ from .message import (
     Message as Message,
     read_message as read_message,
 )
+from .brokers.opcua import (
+    Reporting as Reporting,
+    read_reporting as read_reporting,
+)
 from .output import (
     Estimates as Estimates,
     Output as Output,

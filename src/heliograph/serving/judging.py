@@ -92,4 +92,5 @@ def _columns(places: Sequence[Place]) -> np.ndarray:
 
 
 def _listens(fleet: Fleet, place: Place) -> bool:
-    return bool(fleet.network.nodes[place.node].filters[place.filter].received)
+    item = fleet.network.nodes[place.node].filters.get(place.filter)  # a fusion between neighbours is none
+    return item is not None and bool(item.received)

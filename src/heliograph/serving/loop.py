@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Protocol, TypeVar
 
 from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 T = TypeVar("T")
@@ -21,7 +22,7 @@ class Takes(Protocol):
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Use messages and commit; return the outputs to publish."""
 
     def published(self, outputs: Sequence[Output]) -> None:

@@ -2,22 +2,24 @@
 
 from datetime import datetime
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapter, ValidationError, WithJsonSchema
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.dates import instant
 
-Name = Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")]  # PostgreSQL keeps no NUL
+Name = TypeAliasType("Name", Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")])  # PostgreSQL keeps no NUL
 # Text that is no date is refused: "0.1" is no number of seconds, nor a moment of 1970.
 Date = Annotated[
     datetime,
     GetPydanticSchema(lambda _, __: no_info_after_validator_function(instant, str_schema())),
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
-Moment = float | Date
+Moment = TypeAliasType("Moment", float | Date)
+Count = TypeAliasType("Count", Annotated[int, Field(ge=0, lt=2**63)])
 EXPECTED = {
     "plant": "a name of at most 200 characters, without NUL",
     "node": "a name of at most 200 characters, without NUL",
@@ -49,13 +51,14 @@ class Message(BaseModel):
 
     plant: Name = Field("", description="Which of the plants that are of this network; one needs no name.")
     node: Name = Field(description='A node of the network, or "inputs": then the values are the plant\'s inputs.')
-    sequence: int = Field(ge=0, lt=2**63, description="The node's own count; gaps in it are what was lost.")
+    sequence: Count = Field(description="The node's own count; gaps in it are what was lost.")
     time: Moment = Field(description="When it was measured: steps, seconds, or an ISO 8601 date with a zone.")
     values: list[float | None] = Field(default=[], description="Values received; null did not arrive.")
     inputs: list[float | None] | None = Field(None, description="The plant's inputs without dt; null stays as it was.")
     arrival: Moment | None = Field(None, description="Time of arrival; at once if left out.")
 
 
+Payload: TypeAlias = bytes | Message | str  # a line of JSON; a message read already; why it could not be read
 _READER = TypeAdapter(Message)
 
 

@@ -12,6 +12,7 @@ from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import Part, connected
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
@@ -40,6 +41,7 @@ class ServiceSettings:
         parts: number of parts of the plants that several processes share.
         page: port, or address and port, of the page.
         anew: names of plants that begin anew.
+        sources: sources of messages that others make, by topic; None reads messages in our own form alone.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -54,6 +56,7 @@ class ServiceSettings:
     parts: int | None = None
     page: str | None = None
     anew: tuple[str, ...] = ()
+    sources: object = None
 
     def __post_init__(self) -> None:
         if self.snapshot is not None:
@@ -67,6 +70,10 @@ class ServiceSettings:
             check_count("--parts", self.parts)
             if self.store is None or self.broker is None:
                 raise fail("--parts", "a store and a broker that all processes share", "not both")
+            if self.sources is not None:
+                raise fail(
+                    "--parts", "messages in our own form, which name their part", "sources in the network's file"
+                )
 
 
 def store_of(network: str, given: str | None, parts: int | None) -> str | None:
@@ -114,16 +121,22 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
+    # The store first, whose state the service goes on from.
     stop = asyncio.Event()
     fleet = Fleet(lanes, settings.options)
     store = _open_store(settings, fleet)
     resumed, service = store.count() > 0, Service(fleet, store, _say)
     try:
         with signals(stop):
-            transport = Pipe() if settings.broker is None else connected(settings.broker)
+            reads = None if settings.sources is None else Translator(settings.sources, settings.network)
+            broker = settings.broker
+            transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
             await serve_until(stop, look(service), transport)
     finally:
         store.close()
+    # What was not used, in words.
+    for left in [] if reads is None else reads.left_out():
+        _say(left)
     if resumed and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")

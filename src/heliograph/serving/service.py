@@ -17,7 +17,7 @@ from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
 from heliograph.serving.lanes import Lanes, Place
-from heliograph.serving.message import Message, read_message
+from heliograph.serving.message import Message, Payload, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
 from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
@@ -25,7 +25,7 @@ from heliograph.serving.storage.store_protocol import ConflictError, Entry, Stor
 from heliograph.serving.using import Using
 
 
-class Teller:
+class OutputWriter:
     """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
 
     def __init__(self, lanes: Lanes):
@@ -107,19 +107,19 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
-        self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
+        self._writer, self._using = OutputWriter(fleet.lanes), Using(fleet, self.plants)
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
-        """Use messages, each a JSON object, and commit; return the outputs to publish.
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Use messages, each a JSON object or read already, and commit; return the outputs to publish.
 
         Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
         """
         with _without_collection():
             return self._take(payloads)
 
-    def _take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def _take(self, payloads: Sequence[Payload]) -> list[Output]:
         begun = perf_counter()
         messages = [_read(payload) for payload in payloads]
         self._load({message.plant for message in messages if isinstance(message, Message)})
@@ -165,7 +165,7 @@ class Service:
         self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
-    def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
+    def _taken(self, messages: Sequence[Message | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
         # Messages of damaged plants are refused; all others are used.
@@ -178,7 +178,8 @@ class Service:
             plant, verdict, why, notes = next(outcomes)
             if isinstance(message, str) or verdict is None:
                 malformed += 1
-                entries.append(_refused(None, {}, "malformed", f"{why}: {shown(payload)}"))
+                said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
+                entries.append(_refused(None, {}, "malformed", said))
                 continue
             if plant is not None:
                 touched[plant.name] = plant
@@ -262,7 +263,7 @@ class Service:
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
         senders = self.fleet.senders(plant) if kind == "provisional" else {}
-        return self._teller.estimates(kind, plant.name, moment, outputs, senders)
+        return self._writer.estimates(kind, plant.name, moment, outputs, senders)
 
 
 @contextmanager
@@ -277,8 +278,10 @@ def _without_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _read(payload: bytes) -> Message | str:
+def _read(payload: Payload) -> Message | str:
     """Parse a message, or return the reason why it is malformed."""
+    if not isinstance(payload, bytes):
+        return payload
     try:
         return read_message(payload)
     except InputError as error:

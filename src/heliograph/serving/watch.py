@@ -14,6 +14,7 @@ from scipy.special import gammaincinv
 from heliograph.live.event import VERDICTS
 from heliograph.model.estimate import Claim
 from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
@@ -196,7 +197,7 @@ class Watch:
     def _keep(self, plant: str, message: Mapping[str, Any]) -> None:
         self._count += 1
         estimates = {
-            node: {name: _band(filter_) for name, filter_ in filters.items()}
+            node: {name: _band(points) for name, points in filters.items()}
             for node, filters in message["estimates"].items()
         }
         points = _newest(self._points, plant, lambda: deque(maxlen=POINTS))
@@ -237,16 +238,16 @@ class Watch:
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
                 "links": _added(results),
-                "tests": [_test_row(node, filter_, test) for (node, filter_), test in tests.items()],
+                "tests": [_test_row(node, filter_name, test) for (node, filter_name), test in tests.items()],
                 "warnings": list(self._warnings(results, tests))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": _added(item for _, item in self.plants()),
             }
 
     def _warnings(self, plants: Sequence[Plant], tests: Mapping[tuple[str, str], RunningNis]) -> Iterator[str]:
-        for (node, filter_), test in tests.items():
+        for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
-                yield f"{node}/{filter_}: {doubt}"
+                yield f"{node}/{filter_name}: {doubt}"
         for node, link in _added(plants).items():
             if link["late"]:
                 yield f"{node}: {link['late']} came too late to be used; a longer --window would hold what they change"
@@ -270,7 +271,7 @@ class Watched:
         """Return the service's unpublished outputs."""
         return self.service.unpublished()
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, and record its outputs."""
         with self.watch.lock:
             outputs = self.service.take(payloads)
@@ -319,7 +320,7 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
     return results
 
 
-def _test_row(node: str, filter_: str, item: RunningNis) -> dict[str, object]:
+def _test_row(node: str, filter_name: str, item: RunningNis) -> dict[str, object]:
     low, high = item.band()
     numbers = {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
-    return {"node": node, "filter": filter_, "claim": item.claim, **numbers, "doubt": item.doubt() is not None}
+    return {"node": node, "filter": filter_name, "claim": item.claim, **numbers, "doubt": item.doubt() is not None}

@@ -8,6 +8,16 @@ from .centres.before_data import (
     cross_covariances as cross_covariances,
     fused_covariances as fused_covariances,
 )
+from .centres.mesh_errors import (
+    MeshErrors as MeshErrors,
+    best_possible as best_possible,
+    freeze as freeze,
+    mesh_arrivals as mesh_arrivals,
+    mesh_errors as mesh_errors,
+)
+from .centres.mesh_mean import (
+    mean_mesh_errors as mean_mesh_errors,
+)
 from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,

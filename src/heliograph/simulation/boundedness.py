@@ -106,7 +106,7 @@ def certify_boundedness(network: Network) -> Boundedness:
 def _links(network: Network, states: int) -> Links:
     """Join all nodes: sensors stacked, channels in parallel."""
     if network.relays is not None:
-        raise fail("boundedness", "nodes that hear the sensors over channels", "relays that filter")
+        raise fail("boundedness", "nodes that receive the sensors over channels", "relays that filter")
     # Sensors one above the other.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)

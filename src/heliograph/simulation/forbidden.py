@@ -5,12 +5,12 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
-def forbidden_rows(node: Node | Listener, z: Float[np.ndarray, "steps received"]) -> list[int]:
+def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
     """Rows at which a value came though it was within delta of the value before, and no heartbeat was due.
 
     Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter

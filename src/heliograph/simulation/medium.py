@@ -56,9 +56,9 @@ class AbstractMedium(Module):
 class NodeGroup(Module):
     """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
-    `teller`: the filters that are fed back to the sensors, whose estimates stand at `place` (kind, filter) among all.
+    `reference_filter`: the filters that are fed back to the sensors; their estimates stand at `place` (kind, filter).
 
-    `trigger`: when they send; its prediction is that of a filter too, the `teller`.
+    `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`.
 
     Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
     """
@@ -67,9 +67,16 @@ class NodeGroup(Module):
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
-    teller: FedBackFilter | EventFilter | StochasticEventFilter | None
+    reference_filter: FedBackFilter | EventFilter | StochasticEventFilter | None
     trigger: AbstractTrigger | None
     place: tuple[int, int] | None = eqx.field(static=True)
+
+
+class Silent(Module):
+    """Nodes without a sensor."""
+
+    count: int = eqx.field(static=True)
+    place: None = eqx.field(static=True, default=None)
 
 
 class LinkState(NamedTuple):
@@ -83,18 +90,19 @@ class LinkState(NamedTuple):
 class SeparateChannels(AbstractMedium):
     """Nodes with a sensor and a channel each."""
 
-    groups: tuple[NodeGroup, ...]
+    groups: tuple[NodeGroup | Silent, ...]
 
     def init(self, key: jax.Array) -> PyTree:
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
 
         def single(group: NodeGroup) -> LinkState:
-            feed_back = None if group.teller is None else _first_mean(group.teller)
+            feed_back = None if group.reference_filter is None else _first_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
 
-        return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
+        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))
+        return tuple(() if isinstance(group, Silent) else both(group) for group in self.groups)
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
@@ -104,21 +112,28 @@ class SeparateChannels(AbstractMedium):
         def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             sensor = at(group.sensor, k)
             y = sensed(sensor, x, draw_key(key, k, group.checksums, SENSOR))
-            if isinstance(group.teller, FedBackFilter) and reach.feed_back is not None:
-                y = y - group.teller.reference(reach.feed_back, u, k)
+            if isinstance(group.reference_filter, FedBackFilter) and reach.feed_back is not None:
+                y = y - group.reference_filter.reference(reach.feed_back, u, k)
             memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
             if group.trigger is None or reach.sender is None:
                 return LinkState(memory, reach.feed_back), z
             # The sender decides, by its own reference.
             sender = reach.sender
-            if group.trigger.reference == "prediction" and group.teller is not None and reach.feed_back is not None:
-                sender = sender._replace(reference=group.teller.reference(reach.feed_back, u, k))
+            if (
+                group.trigger.reference == "prediction"
+                and group.reference_filter is not None
+                and reach.feed_back is not None
+            ):
+                sender = sender._replace(reference=group.reference_filter.reference(reach.feed_back, u, k))
             drawn = draw_key(key, k, group.checksums, TRIGGER)
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
             return LinkState(memory, reach.feed_back, sender), z
 
         both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0))
-        results = [both(group, reach) for group, reach in zip(self.groups, state, strict=True)]
+        results = [
+            (reach, jnp.zeros((group.count, 0))) if isinstance(group, Silent) else both(group, reach)
+            for group, reach in zip(self.groups, state, strict=True)
+        ]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
@@ -130,7 +145,8 @@ class SeparateChannels(AbstractMedium):
 
     def reasons(self, state: PyTree) -> dict[str, jax.Array]:
         """Return the reasons for which senders that decide transmitted at this step, by group, (node, m)."""
-        return {str(g): reach.sender.last for g, reach in enumerate(state) if reach.sender is not None}
+        links = ((g, reach) for g, reach in enumerate(state) if isinstance(reach, LinkState))
+        return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
 
 
 def _first_mean(item: AbstractFilter) -> jax.Array:
@@ -286,19 +302,25 @@ def medium_of(network: Network) -> AbstractMedium:
         received = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
-    groups, places = [], network.places()
+    groups: list[NodeGroup | Silent] = []
+    places = network.places()
     local = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in local.items()})
     for names in network.groups:
+        if names[0] not in local:
+            groups.append(Silent(len(names)))
+            continue
         parts = stack([(local[name].sensor, _unnamed(local[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])
         informed_by = local[names[0]].informed_by or local[names[0]].predictor
-        teller: PyTree = None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+        reference_filter: PyTree = (
+            None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+        )
         place = None if informed_by is None else places[names[0], informed_by][:2]
         triggers: PyTree = [local[name].trigger for name in names]
         trigger = None if triggers[0] is None else stack(triggers)
-        groups.append(NodeGroup(*parts, checksums, held, teller, trigger, place))
+        groups.append(NodeGroup(*parts, checksums, held, reference_filter, trigger, place))
     return SeparateChannels(tuple(groups))
 
 

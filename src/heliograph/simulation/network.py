@@ -25,11 +25,12 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
+from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import (
     Common,
-    Listener,
     Node,
+    ReceivingNode,
     check_filters,
     check_received,
     check_sizes,
@@ -40,7 +41,8 @@ from heliograph.simulation.node import (
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
-LOCAL = "own"  # a relay's one filter
+LOCAL = "local"  # a relay's one filter
+SENSORLESS = ReceivingNode({}, 0, (), True)  # a node that estimates from its neighbours alone
 
 
 class Kind(NamedTuple):
@@ -60,38 +62,47 @@ class Network(Module):
 
     Args:
         plant: the plant.
-        nodes: nodes by name.
+        nodes: nodes by name; None for a node without a sensor, which estimates from its neighbours.
         fused: fusions by name: a `Fusion` of the estimates of one of the nodes' filters, or a central filter that
             receives all measurements, joined in the order of the nodes. In results they stand under the node name
-            "fused". None by default.
+            "fused", and fusions between neighbours under each of their nodes. None by default.
         relays: network of relays, set by `Network.of_relays`.
         common: common sensor and channel, set by `Network.sharing`.
 
     Raises:
-        ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has.
+        ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has; between
+            neighbours a node that cannot know the plant's state from those upstream.
     """
 
     plant: AnyPlant
-    nodes: dict[str, Node | Listener]
+    nodes: dict[str, Node | ReceivingNode]
     fused: dict[str, Fusion | AbstractFilter]
+    meshes: dict[str, Fusion]
     relays: RelayNetwork | None
     common: Common | None
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
+    mesh_kinds: tuple[Kind, ...] = eqx.field(
+        static=True
+    )  # of fusions between neighbours, sorted as in compiled code, after the filters' kinds
     single: bool = eqx.field(static=True)
 
     def __init__(
         self,
         plant: AnyPlant,
-        nodes: Mapping[str, Node | Listener],
-        fused: Mapping[str, Fusion | AbstractFilter] | None = None,
-        relays: RelayNetwork | None = None,
-        common: Common | None = None,
+        nodes: "Mapping[str, Node | ReceivingNode | None]",
+        fused: "Mapping[str, Fusion | AbstractFilter] | None" = None,
+        relays: "RelayNetwork | None" = None,
+        common: "Common | None" = None,
     ):
         self.plant, self.relays, self.common, self.single = plant, relays, common, False
-        self.nodes = table("nodes", nodes, "nodes")
-        self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
+        self.nodes = {
+            name: SENSORLESS if node is None else node for name, node in table("nodes", nodes, "nodes").items()
+        }
+        fusions = {} if fused is None else table("fused", fused, "fusions and central filters")
+        self.meshes = {name: item for name, item in fusions.items() if isinstance(item, Fusion) and item.neighbours}
+        self.fused = {name: item for name, item in fusions.items() if name not in self.meshes}
         self.names = tuple(self.nodes)
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
@@ -99,19 +110,24 @@ class Network(Module):
         # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
-            for filter_, element in node.filters.items():
-                check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
+            if node != SENSORLESS:
+                check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
+            for label, element in node.filters.items():
+                check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
         # Groups of nodes and kinds of filters, by structure.
-        self.groups = _grouped((name, (_world(n), n.filters)) for name, n in self.nodes.items())
+        meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
+        self.groups = _grouped((name, (_world(n), n.filters, meshes[name])) for name, n in self.nodes.items())
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)
             for alike in _grouped(self.nodes[names[0]].filters.items())
+        )
+        self.mesh_kinds = tuple(
+            Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
         # Sensors and channels of each group fit, then fusions.
         for names in self.groups:
@@ -120,6 +136,8 @@ class Network(Module):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
                 received_angles(plant, node.sensor, node.channel)
         self._check_fused()
+        for name, mesh in self.meshes.items():
+            check_mesh(name, mesh, self)
 
     def _check_fused(self) -> None:
         for name, item in self.fused.items():
@@ -141,7 +159,7 @@ class Network(Module):
 
         At each step the relays send C s_r, with s_r their estimates at the step before, through hops with independent
         draws; every filter then receives the sum of its hops, NaN where nobody transmits to it by plan. The nodes are
-        the relays, each with a single filter "own", and "receiver". A recording may leave out what a relay received.
+        the relays, each with a single filter "local", and "receiver". A recording may leave out what a relay received.
 
         Args:
             relays: the relays' slots and hops.
@@ -168,7 +186,7 @@ class Network(Module):
         outputs = tuple(first(relays.sensor).outputs)
         # All places receive sums of hops.
         nodes = {
-            name: Listener(filters[name], item, outputs, relays.always_receives(name))
+            name: ReceivingNode(filters[name], item, outputs, relays.always_receives(name))
             for name, item in zip(relays.filters, relays.received, strict=True)
         }
         return Network(relays.plant, nodes, relays=relays)
@@ -199,16 +217,18 @@ class Network(Module):
         check_forgets("channel of nodes that share it", first(channel))
         # Each output goes to one node.
         received = {
-            name: max((item.received for item in filter_.values()), default=0) for name, filter_ in filters.items()
+            name: max((item.received for item in by_name.values()), default=0) for name, by_name in filters.items()
         }
         if sum(received.values()) != first(channel).outputs:
             raise fail(
-                "nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", received
+                "nodes that share a channel", f"to receive its {first(channel).outputs} outputs, each once", received
             )
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
-        for name, filter_ in filters.items():
-            check_filters(filter_, received[name])
-        nodes = {name: Listener(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()}
+        for name, by_name in filters.items():
+            check_filters(by_name, received[name])
+        nodes = {
+            name: ReceivingNode(dict(by_name), received[name], names, complete) for name, by_name in filters.items()
+        }
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
     def rows(self) -> dict[str, np.ndarray]:
@@ -253,6 +273,11 @@ class Network(Module):
             for i, node in enumerate(self.groups[kind.group])
         }
 
+    def mesh_nodes(self, name: str) -> tuple[str, ...]:
+        """Names of the nodes of a fusion between neighbours, in the order of the network."""
+        neighbours = self.meshes[name].neighbours or {}
+        return tuple(node for node in self.names if node in neighbours)
+
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the plant's states."""
@@ -281,6 +306,10 @@ class Network(Module):
         claims = {
             name: {f: claim_at(node, item) for f, item in node.filters.items()} for name, node in self.nodes.items()
         }
+        for name, mesh in self.meshes.items():
+            claim = mesh_claim(name, mesh, self)
+            for node in self.mesh_nodes(name):
+                claims[node][name] = claim
         if self.fused:
             claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
             if any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values()):
@@ -306,7 +335,7 @@ class Network(Module):
         # An informed rule: it needs the joint moments of the errors.
         known = self.parts_of(item.filter)
         if len(known) < len(local):
-            raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
+            raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
         if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
                        type(next(iter(known.values()))[2]).__name__)  # fmt: skip
@@ -327,14 +356,14 @@ class Network(Module):
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 
 
-def _world(node: Node | Listener) -> object:
+def _world(node: Node | ReceivingNode) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
         return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
 
 
-def claim_at(node: Node | Listener, item: AbstractFilter) -> Claim:
+def claim_at(node: Node | ReceivingNode, item: AbstractFilter) -> Claim:
     """Claim of a filter at a node."""
     return node.claim_of(item) if isinstance(node, Node) else item.claim
 

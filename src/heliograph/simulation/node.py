@@ -55,10 +55,10 @@ class Node(Module):
         self,
         sensor: AnySensor,
         channel: Channel,
-        filters: Mapping[str, AbstractFilter],
+        filters: "Mapping[str, AbstractFilter]",
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
-        trigger: AbstractTrigger | None = None,
+        trigger: "AbstractTrigger | None" = None,
     ):
         self.trigger = trigger
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
@@ -124,7 +124,7 @@ class Node(Module):
 
 
 @readable
-class Listener(Module):
+class ReceivingNode(Module):
     """A place in a network of relays, which receives from relays or the sensor, and its filters.
 
     `received` numbers named after `outputs` arrive, always all of them if it is `complete`.

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import computed
 from heliograph.numerics.check import array, check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
@@ -18,24 +20,27 @@ from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
-Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
+Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
+
+
+Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
 
 
 def run(
-    network: Network,
-    measurements: Mapping[str, ArrayLike],
+    network: "Network",
+    measurements: "Mapping[str, ArrayLike]",
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     time: Float[ArrayLike, " steps"] | None = None,
-    truth: Float[ArrayLike, "steps n"] | None = None,
-    smooth: AbstractSmoothing | None = None,
-    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
-) -> Record:
+    truth: "Float[ArrayLike, 'steps n'] | None" = None,
+    smooth: "AbstractSmoothing | None" = None,
+    reports: Reports | None = None,
+) -> "Record":
     """Run every filter of the network over recorded measurements.
 
     Values beyond a node's limits, and those that are implausible for all filters of a node
@@ -52,8 +57,9 @@ def run(
             default.
         smooth: smoothing as in `monte_carlo`; None by default.
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
-            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be
-            left out where the uplinks are deterministic.
+            at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
+            fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
+            message did not arrive. They may be left out where the links are deterministic.
 
     Returns:
         The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.
@@ -89,16 +95,18 @@ def run(
     filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
         given = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = {
+        arrivals: dict[str, PyTree] = {
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
+        } | {
+            name: mesh.edges.recorded(name, mesh.nodes, given.get(name), steps) for name, mesh in filters.meshes.items()
         }
         result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
     record = found_record(network, part, result, clock)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 
-def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Measurements without those beyond their node's limits, which are warned of."""
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z
@@ -140,7 +148,10 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 
 def _filtered(*arguments: PyTree) -> PyTree:
-    """Results of `_run_filters` as NumPy arrays."""
+    """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
+    filters = arguments[0]
+    if filters.meshes:  # nodes by the hundred are no straight-line code
+        return to_numpy(_by_xla(*arguments))
     return computed(_run_filters, _by_xla, arguments)
 
 

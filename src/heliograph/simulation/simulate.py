@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, get_args, overload
+from typing import Any, Literal, get_args, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import quickly_compiled
@@ -28,9 +29,10 @@ from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
 from heliograph.smoothing.modes import AbstractSmoothing
 
-Progress = Callable[[int, int], None]
-
-Precision = Literal["float64", "float32"]
+Progress = TypeAliasType("Progress", Callable[[int, int], None])
+Seed = TypeAliasType("Seed", int | jax.Array)  # or a JAX key
+Reducer = TypeAliasType("Reducer", AbstractReducer[Any])
+Precision = TypeAliasType("Precision", Literal["float64", "float32"])
 
 
 @overload
@@ -38,7 +40,7 @@ def monte_carlo(
     network: Network,
     horizon: int,
     runs: int,
-    key: int | jax.Array,
+    key: Seed,
     keep: None = None,
     inputs: ArrayLike | None = None,
     chunk: int = 2048,
@@ -52,7 +54,7 @@ def monte_carlo(
     network: Network,
     horizon: int,
     runs: int,
-    key: int | jax.Array,
+    key: Seed,
     keep: AbstractReducer[Result],
     inputs: ArrayLike | None = None,
     chunk: int = 2048,
@@ -64,18 +66,18 @@ def monte_carlo(
 
 
 def monte_carlo(
-    network: Network,
+    network: "Network",
     horizon: int,
     runs: int,
-    key: int | jax.Array,
-    keep: AbstractReducer[Result] | None = None,
+    key: Seed,
+    keep: Reducer | None = None,
     inputs: ArrayLike | None = None,
     chunk: int = 2048,
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
-    smooth: AbstractSmoothing | None = None,
-) -> Record | Result:
+    smooth: "AbstractSmoothing | None" = None,
+) -> "Record | Any":
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
     A run's draws depend on the key, the run, the step and the node's name alone, so neither the chunk size nor another
@@ -112,18 +114,18 @@ def monte_carlo(
     if check_count("first_run", first_run, 0) % BLOCK:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
     network.check_horizon(horizon)
-    reducer: AbstractReducer[Record] | AbstractReducer[Result] = Trajectories() if keep is None else keep
+    reducer: AbstractReducer[Record] | AbstractReducer[Any] = Trajectories() if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
-    if not isinstance(precision, str) or precision not in get_args(Precision):
-        raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
+    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
+        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if not single and one_processor():
+    if not single and not network.meshes and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
-        made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
+        made: Record | Any = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
         if made is not None:
             return made
     # Otherwise XLA: the world, and what is collected of it.
@@ -136,7 +138,7 @@ def monte_carlo(
     known = network.in_single_precision() if single else network
     if part is not None:
         claims = lowered(part.claims) if single else part.claims
-        result: Record | Result = both.finished(*recorded, known, part._replace(claims=claims))
+        result: Record | Any = both.finished(*recorded, known, part._replace(claims=claims))
         return result
     return reducer.finish(*recorded, known)
 

@@ -45,11 +45,11 @@ class Smoother(Module):
 
     def both(self, result: PyTree) -> PyTree:
         """Results of runs (run, time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
-        steps_ = [result["smoother_steps"][k] for k in self.kinds]
+        steps_by_kind = [result["smoother_steps"][k] for k in self.kinds]
         filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "central_steps")}
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         # Smoothed estimates of nodes and central filters, then their fusions.
-        estimates = tuple(self._estimates(steps, 2) for steps in steps_)
+        estimates = tuple(self._estimates(steps, 2) for steps in steps_by_kind)
         fused = {name: self._estimates(steps, 0) for name, steps in result["central_steps"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
@@ -64,9 +64,9 @@ class Smoother(Module):
         }
         if "truth" in result:
             truth = self.smoothing.about(result["truth"])
-            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_])}
+            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_by_kind])}
         # Sums of the NIS, for the test of consistency.
-        nis = tuple(each_run(surprised, steps) for steps in steps_)
+        nis = tuple(each_run(surprised, steps) for steps in steps_by_kind)
         centrally = {name: each_run(nis_sums, steps) for name, steps in result["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
@@ -125,6 +125,9 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
     """
     instance("smooth", smoothing, AbstractSmoothing, "one such as hg.smoothing.FixedInterval()")
     smoothing.check(horizon)
+    if network.meshes:
+        between = f"fusions between neighbours {list(network.meshes)}"
+        raise fail("smoothing", "filters, and fusions at a centre", between)
     # Relays send filtered estimates: the receiver alone is smoothed.
     part = network
     if network.relays is not None:

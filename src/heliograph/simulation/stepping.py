@@ -29,9 +29,10 @@ from heliograph.simulation.centres.centre import (
 from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
-from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
+from heliograph.simulation.centres.mesh import Mesh, meshes_of
+from heliograph.simulation.centres.uplinks import uplinks_of
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
 from heliograph.smoothing.backward_pass import planned_with_past
 
@@ -47,6 +48,7 @@ class AllFilters(Module):
     fusions: tuple[Fused, ...]
     centres: tuple[Centre | LinearisedCentre, ...]
     reporting: dict[str, Reporting]
+    meshes: dict[str, Mesh]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
@@ -76,7 +78,7 @@ class AllFilters(Module):
         # Central filters, fusions, informed centres, centres with reports.
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
-        self.reporting = _reporting(network)
+        self.reporting, self.meshes = _reporting(network), meshes_of(network)
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
@@ -86,11 +88,12 @@ class AllFilters(Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """Return states before the first step: of nodes' filters, central filters, quantizers, centres, reports."""
+        """Return states before the first step: of filters, central ones, quantizers, centres, reports, neighbours."""
         central = {name: started(item) for name, item in self.central.items()}
         local = tuple(item.init() for item in self.alike)
         sent = tuple(item.init(self.n) for item in self.fusions)
-        reporting = {name: item.init() for name, item in self.reporting.items()}
+        reporting: dict[str, PyTree] = {name: item.init() for name, item in self.reporting.items()}
+        reporting |= {name: item.init() for name, item in self.meshes.items()}
         return local, central, sent, tuple(self._started(item, local) for item in self.centres), reporting
 
     def _started(self, centre: Centre | LinearisedCentre, local: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
@@ -120,7 +123,7 @@ class AllFilters(Module):
         z: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
-        drawn: Mapping[str, Drawn] | None = None,
+        drawn: Mapping[str, PyTree] | None = None,
         skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
         """Step all filters with the measurements of each group, and with the draws of the uplinks, by fusion.
@@ -161,11 +164,19 @@ class AllFilters(Module):
             learned.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
-        published, reports = {}, {}
+        published: dict[str, PyTree] = {}
+        reports: dict[str, PyTree] = {}
         for name, link in self.reporting.items():
             happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
             published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
             uplinks |= {name: traffic} if traffic else {}
+        # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
+        for name, mesh in sorted(self.meshes.items()):
+            flags = mesh.edges.lossless() if drawn is None else drawn[name]
+            if drawn is None and mesh.edges.groups:
+                raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
+            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k)
+            estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Next states and results.
         local, central = tuple(state for state, _ in results), {name: state for name, (state, _) in received.items()}
         following = local, central, tuple(after), tuple(learned), published
@@ -269,7 +280,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
         observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
-        raise fail("fusion", f"one of {observation}, which hear reports", repr(name))
+        raise fail("fusion", f"one of {observation}, which receive reports", repr(name))
     # The nodes with that filter alone, for the moments of its errors.
     names = network.nodes_with(fusion.filter)
     alone = Network(
@@ -295,7 +306,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     )
 
 
-def _with_only(node: Node | Listener, name: str) -> Node | Listener:
+def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
     filters = {single: item for single, item in node.filters.items() if single == name}
     if isinstance(node, Node):

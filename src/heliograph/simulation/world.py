@@ -25,18 +25,22 @@ class World(Module):
     def init(self, key: jax.Array) -> PyTree:
         """Return the state before the first step of the run with this key."""
         x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
-        return x, self.medium.init(key), self.filters.init()
+        edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
+        return x, self.medium.init(key), self.filters.init(), edges
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step to k with the input u: next state, and truth (n,), measurements and estimates."""
-        (x, medium, states), (k, u) = carry, row
+        (x, medium, states, edges), (k, u) = carry, row
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
         z = tuple(arrived(item) if whole else item for item, whole in zip(z, self.filters.complete, strict=True))
-        drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        drawn: dict[str, PyTree] = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        across = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
+        edges = {name: state for name, (state, _) in across.items()}
+        drawn |= {name: arrived for name, (_, arrived) in across.items()}
         states, result = self.filters.step(states, z, u, k, drawn)
-        after = x, self.medium.feed_back(medium, result["estimates"]), states
+        after = x, self.medium.feed_back(medium, result["estimates"]), states, edges
         seen = {"truth": x, "measurements": z, "transmissions": self.medium.reasons(medium), **_near(plant, x, result)}
         return after, seen
 

@@ -18,12 +18,12 @@ T = TypeVar("T")
 
 
 def smoother_steps(
-    filter: AbstractFilter,
+    filter: "AbstractFilter",
     measurements: Float[ArrayLike, "steps received"],
     inputs: Float[ArrayLike, "steps inputs"] | None = None,
     state: PyTree | None = None,
     first_step: int = 0,
-) -> tuple[PyTree, AbstractSmootherStep]:
+) -> "tuple[PyTree, AbstractSmootherStep]":
     """Step a filter over rows of data: its state after them, and its smoother steps stacked along time.
 
     Args:
@@ -150,11 +150,13 @@ def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, item: PyTree) -> tuple[Point, Moments]:
-        after = item.ahead(point)
+    def body(point: Point, item: tuple[AbstractSmootherStep, jax.Array]) -> tuple[Point, Moments]:
+        here, before = item
+        after = here.ahead(point, before)
         return after, Moments(after.mean, after.covariance)
 
-    _, outcome = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
+    rows = rows_of(steps, slice(step + 1, None)), steps.covariance[step:-1]
+    _, outcome = jax.lax.scan(body, start.start(), rows)
     first = Moments(start.mean, start.covariance)
     whole = jax.tree.map(lambda item, rest: jnp.concatenate([item[None], rest]), first, outcome)
     result: Estimate = jax.vmap(start.estimate_from)(whole)

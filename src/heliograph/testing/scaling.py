@@ -75,7 +75,7 @@ def _nodes(network: Network) -> dict[str, Node]:
     """Return the nodes, all of which must measure the plant themselves."""
     results = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if len(results) < len(network.nodes):
-        raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
+        raise fail("network to rescale", "nodes that receive the plant themselves", "a network of relays")
     return results
 
 

@@ -107,7 +107,7 @@ def shown_network(s: Scenario) -> hg.Network:
 
 
 def literal_network(s: Scenario) -> hg.Network:
-    """The same nodes, which hear the same, with the literal readings of Algorithm 1."""
+    """The same nodes, which receive the same, with the literal readings of Algorithm 1."""
     return _assemble(s, [variants(s, i) for i in range(len(NODES))], {})
 
 

@@ -1,4 +1,4 @@
-"""Data that come late, told or not, and clocks that are wrong: what filters claim, and what is true."""
+"""Data that come late, with time stamps or without, and clocks that are wrong: what filters claim, and what is true."""
 
 from heliograph_studies.delays import compute, figures
 from heliograph_studies.delays.setting import Setting as Setting

@@ -85,7 +85,7 @@ def late_filters() -> dict[str, dict[str, hg.filters.AbstractFilter]]:
     filters: dict[str, dict[str, hg.filters.AbstractFilter]] = {
         name: {name: hg.linear_filter(PLANT, SENSOR, link)} for name, link in LINKS.items()
     }
-    filters["untold"]["as_current"] = hg.filters.as_current_filter(PLANT, SENSOR, LINKS["untold"])
+    filters["uninformed"]["as_current"] = hg.filters.as_current_filter(PLANT, SENSOR, LINKS["uninformed"])
     return filters
 
 
@@ -114,7 +114,7 @@ def variances(record: hg.Record, node: str, name: str, state: int) -> tuple[np.n
 def before_data(simulated: Mapping[str, Late]) -> dict[str, Late]:
     """The same with true errors before any data, of filters whose gains depend on none."""
     result = dict(simulated)
-    for node in ("untold", "none"):
+    for node in ("uninformed", "none"):
         for name, item in late_filters()[node].items():
             true = hg.filters.true_error(item, PLANT, SENSOR, LINKS[node], STEPS).true[:, 0, 0]
             mean = float(true[HALF].mean())
@@ -156,7 +156,7 @@ def deviation(record: hg.Record, name: str, state: int) -> Deviation:
 
 
 def trap() -> float:
-    """What a filter claims that holds past states in place of past signals: one y heard twice has two noises."""
+    """What a filter claims that holds past states in place of past signals: one y received twice has two noises."""
     noise, spread = np.zeros((6, 6)), np.zeros((6, 6))
     noise[:2, :2], spread[:2, :2] = NOISE, PLANT.initial_covariance
     moved = np.block([[np.asarray(PLANT.matrix), np.zeros((2, 4))], [np.eye(4), np.zeros((4, 2))]])

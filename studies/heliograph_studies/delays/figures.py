@@ -10,8 +10,8 @@ from heliograph_studies.delays.setting import STEP
 
 LATE = {  # filter: how it is called, and its colour
     "as_current": ("taken as current", VERMILION),
-    "untold": ("delays not told", BLUE),
-    "told": ("time stamps", GREEN),
+    "uninformed": ("delays not known", BLUE),
+    "informed": ("time stamps", GREEN),
     "constant": ("all one step late", PURPLE),
     "none": ("not late", INK),
 }

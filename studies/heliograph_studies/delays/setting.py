@@ -15,8 +15,8 @@ PLANT = hg.LinearPlant([[1.0, 1.0], [0.0, 0.95]], NOISE, [1.0, 0.5], np.diag([1.
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3)
 LINK = hg.hop(1.0, 0.05)
 LINKS: Mapping[str, hg.random_affine.AbstractRandomAffine] = {
-    "untold": hg.model.delayed(LINK, LAW),
-    "told": hg.model.delayed(LINK, LAW, timestamped=True),
+    "uninformed": hg.model.delayed(LINK, LAW),
+    "informed": hg.model.delayed(LINK, LAW, timestamped=True),
     "constant": hg.model.delayed(LINK, 1),
     "none": LINK,
 }
@@ -55,7 +55,7 @@ def moving(
 def listeners(
     plant: hg.LinearPlant, sensors: Mapping[str, hg.model.AbstractSensor]
 ) -> dict[str, hg.filters.AbstractFilter]:
-    """Filters that hear both nodes, and two that hear the wrong clock alone."""
+    """Filters that receive both nodes, and two that receive the wrong clock alone."""
     joint, both = hg.model.joint_sensor(sensors), hg.parallel([hg.perfect(), hg.perfect()])
     alone = hg.parallel([hg.model.silent(1, 1, 1.0), hg.perfect()])
     blind = hg.LinearSensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0]], 0.04 * np.eye(2))

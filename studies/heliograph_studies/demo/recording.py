@@ -25,7 +25,7 @@ class PlazaRecording:
 
     name: a key of FILES. start (s) and start_pose (3,): the first truth sample, before any row. time (rows,) s. truth
     (rows, 3): x m, y m, heading of travel rad, not wrapped. odometry (rows, 3): distance m, gyro's turn rad, duration
-    s, summed up since the row before. ranges (rows, 4) m, NaN for beacons not heard. beacons (4, 2) m. gyro_rate
+    s, summed up since the row before. ranges (rows, 4) m, NaN for beacons not received. beacons (4, 2) m. gyro_rate
     rad/s: the gyro at rest.
     """
 

@@ -1,4 +1,4 @@
-"""A robot mower hears four radio beacons; each range reaches the remote filters through a two-hop relay.
+"""A robot mower receives four radio beacons; each range reaches the remote filters through a two-hop relay.
 
 The constants come from the Plaza2 recording; `calibration` says how and computes them again. Of a drive elsewhere
 (`plaza1`) only the place of its beacons, its start and what its gyro reads at rest are taken.
@@ -94,7 +94,7 @@ def model(drive: Drive, constants: Constants) -> tuple[hg.Plant, hg.Sensor]:
 
 
 def network_of(drive: Drive) -> hg.Network:
-    """The robot on this drive, heard through the relays."""
+    """The robot on this drive, received through the relays."""
     plant, sensor = model(drive, Constants(drive.gyro_rate))
     filters = {
         "relay_aware": hg.cubature_filter(plant, sensor, channel),

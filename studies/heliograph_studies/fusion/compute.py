@@ -25,7 +25,7 @@ RULES = {
     "matrix_with_mean": hg.fusion.MatrixWeights(with_mean=True),
     "all_reports": hg.fusion.AllReports(),
 }
-LOCAL = "own"  # the filter of each node
+LOCAL = "local"  # the filter of each node
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def network(plant: hg.LinearPlant, parts: list[Part]) -> hg.Network:
 
 
 def central(plant: hg.LinearPlant, parts: list[Part], steps: int) -> np.ndarray:
-    """Covariances of the filter that hears everything."""
+    """Covariances of the filter that receives everything."""
     sensors, channels = zip(*map(received_by, parts), strict=True)
     noise = np.diag(np.concatenate([np.diag(s.noise.covariance) for s in sensors]))
     sensor = hg.LinearSensor(np.concatenate([s.matrix for s in sensors]), noise)
@@ -110,7 +110,7 @@ def against_peers(claimed: float, errors: np.ndarray) -> dict[str, float]:
 
 
 def tree(setting: Setting) -> tuple[dict[str, float], list[np.ndarray], dict[str, float]]:
-    """Twelve nodes heard by four relays, these by two, these by the root.
+    """Twelve nodes received by four relays, these by two, these by the root.
 
     Its error, that without the relays, and the central filter's; covariances at every place; what simulation says of
     the root's claim.
@@ -222,11 +222,11 @@ def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
     for informed in (True, False):
         for level in setting.thresholds:
             sends = hg.fusion.EventSending(level, informed)
-            name = f"{'told' if informed else 'untold'} {level}"
+            name = f"{'informed' if informed else 'uninformed'} {level}"
             fused[name] = hg.Fusion(LOCAL, hg.fusion.AllReports(), quantizer=sends)
     net = hg.Network(plant, network(plant, parts).nodes, fused)
     sums = hg.monte_carlo(net, setting.traffic_steps, setting.runs // 4, setting.seed, hg.Statistics())["fused"]
-    result: dict[str, list[dict[str, float]]] = {"every": [], "told": [], "untold": []}
+    result: dict[str, list[dict[str, float]]] = {"every": [], "informed": [], "uninformed": []}
     late = slice(setting.traffic_steps // 2, None)
     for name, item in sums.items():
         kind, number = name.split()

@@ -17,7 +17,7 @@ LABELS = {
     "scalar": "scalar weights",
     "matrix": "matrix weights",
     "matrix_with_mean": "matrix weights and the plant's mean",
-    "all_reports": "all reports ever heard",
+    "all_reports": "all reports ever received",
     "central": "central filter",
 }
 SHORT = {
@@ -27,8 +27,8 @@ SHORT = {
     "all_reports": "all reports",
 }
 NETWORKS = {"three_partial": "partial sensors", "three_rooms": "three rooms", "four_equal": "equal sensors"}
-KINDS = {"every": ("every d-th step", BLUE), "told": ("on event, silence understood", GREEN),
-         "untold": ("on event, silence taken for a loss", VERMILION)}  # fmt: skip
+KINDS = {"every": ("every d-th step", BLUE), "informed": ("on event, silence understood", GREEN),
+         "uninformed": ("on event, silence taken for a loss", VERMILION)}  # fmt: skip
 PLACES = 0, 2  # the states drawn: where the point is in either direction
 LEFT_OUT = ("scalar", "central")  # one is far off, the other is what all are divided by
 
@@ -44,7 +44,7 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def traces_picture(cases: Mapping[str, Mapping[str, float | list[float]]]) -> Figure:
-    """Each rule's trace over that of the central filter, which hears every sensor itself: 1 is the best there is."""
+    """Each rule's trace over that of the central filter, which receives every sensor itself: 1 is the best there is."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots()
     rules = [rule for rule in LABELS if rule not in LEFT_OUT]

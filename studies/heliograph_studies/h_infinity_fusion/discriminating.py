@@ -74,7 +74,7 @@ def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
 def filters(
     node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
 ) -> dict[str, hg.filters.AbstractFilter]:
-    """All filters of a node but the one that is told of losses; each predicts."""
+    """All filters of a node but the one that knows of losses; each predicts."""
     believed, sensor, system = structured.plant(False), structured.sensor(node), structured.system(node)
     results: dict[str, hg.filters.AbstractFilter] = {
         name: hg.filters.h_infinity_filter(believed, sensor, system, element[node]) for name, element in designs.items()
@@ -86,14 +86,14 @@ def filters(
 
 
 def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
-    """One whose receivers are not told of losses, and one whose are, with other draws."""
+    """Network whose receivers do not know of losses, and one whose do, with other draws."""
     believed, lossless, lossy = structured.plant(False), structured.channel(structured.lossless), structured.channel()
     unaware, informed = {}, {}
     for node in structured.OUTPUTS:
         sensor = structured.sensor(node)
         extended = prediction_of(hg.extended_filter(believed, sensor, lossless))
         unaware[node] = hg.Node(sensor, lossy, filters(node, designs))
-        informed[node] = hg.Node(sensor, structured.channel(structured.known), {"ekf_told": extended})
+        informed[node] = hg.Node(sensor, structured.channel(structured.known), {"ekf_known": extended})
     rule = hg.fusion.WeightedFusion(np.full(len(unaware), 1 / len(unaware)))
     return [
         hg.Network(structured.plant(), nodes, {name: hg.Fusion(name, rule) for name in nodes[NODE].filters})

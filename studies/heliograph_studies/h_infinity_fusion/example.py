@@ -88,7 +88,7 @@ def fused_name(name: str, quantizer: str) -> str:
 
 
 def simulate(setting: Setting, designs: Designs) -> Runs:
-    """All filters of one record but those that are told of losses; `designs` by name, one for each node."""
+    """All filters of one record but those that know of losses; `designs` by name, one for each node."""
     nodes = {
         node: hg.Node(setting.disturbed_sensor(i), setting.disturbed_channel(), filters(setting, i, designs))
         for i, node in enumerate(NODES)
@@ -97,7 +97,7 @@ def simulate(setting: Setting, designs: Designs) -> Runs:
 
 
 def filters(setting: Setting, node: int, designs: Designs) -> dict[str, hg.filters.AbstractFilter]:
-    """The filters of one node that hear the losses as they are."""
+    """The filters of one node that receive the losses as they are."""
     return {
         **h_infinity_filters(setting, node, designs),
         "open_loop": hg.filters.open_loop_filter(believed_plant(setting), *start(setting, node)),
@@ -116,12 +116,12 @@ def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[st
 
 
 def simulate_known(setting: Setting) -> Runs:
-    """Extended Kalman filters told of each loss, in a network whose losses are erasures; other draws."""
+    """Extended Kalman filters that know of each loss, in a network whose losses are erasures; other draws."""
     nodes = {
         node: hg.Node(
             setting.disturbed_sensor(i),
             setting.disturbed_channel(setting.known),
-            {"ekf_told": prediction_of(extended(setting, i, setting.lossless))},
+            {"ekf_known": prediction_of(extended(setting, i, setting.lossless))},
         )
         for i, node in enumerate(NODES)
     }

@@ -37,12 +37,12 @@ from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
 NODE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
 LINKS = ("sensor to relay", "relay to filter", "sensor to filter")
 COLOURS = {
-    "horizon": BLUE, "recursive": GREEN, "ekf_statistics": VERMILION, "ekf_ignoring": AMBER, "ekf_told": PURPLE,
+    "horizon": BLUE, "recursive": GREEN, "ekf_statistics": VERMILION, "ekf_ignoring": AMBER, "ekf_known": PURPLE,
     "zero_gain": MUTED, "open_loop": MUTED,
 }  # fmt: skip
 LABELS = {
     RECURSIVE: "the paper's, recursive", "horizon": "H∞, horizon", "recursive": "H∞, recursive",
-    "ekf_statistics": "EKF, statistics", "ekf_ignoring": "EKF, ignoring", "ekf_told": "EKF, told",
+    "ekf_statistics": "EKF, statistics", "ekf_ignoring": "EKF, ignoring", "ekf_known": "EKF, informed",
     "zero_gain": "zero gain", "open_loop": "open loop",
 }  # fmt: skip
 
@@ -153,7 +153,7 @@ def _quantizer(result: Parts) -> Figure:
 
 
 def _second_errors(result: Parts) -> Figure:
-    names, second = ("horizon", "recursive", "ekf_statistics", "ekf_told", "open_loop"), result.discriminating
+    names, second = ("horizon", "recursive", "ekf_statistics", "ekf_known", "open_loop"), result.discriminating
     panels = [
         Panel(f"error, {scenario}", [Curve(LABELS[n], COLOURS[n], second.over_time[scenario][n]) for n in names])
         for scenario in structured.SCENARIOS
@@ -182,9 +182,9 @@ def _second_levels(result: Parts) -> Figure:
 def words(outcome: Outcome) -> dict[str, object]:
     """Labels and colours, and the rows of the tables."""
     result, second = outcome.parts, outcome.parts.discriminating
-    names = ("horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told")
+    names = ("horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_known")
     behind = {q: result.runs.mean_error(RECURSIVE, q) for q in (*QUANTIZERS, *MORE_QUANTIZERS)}
-    runs = {name: result.runs for name in result.runs.filters} | {"ekf_told": result.known}
+    runs = {name: result.runs for name in result.runs.filters} | {"ekf_known": result.known}
     return {
         "p": result,
         "second": second,

@@ -37,7 +37,7 @@ def numbers(result: Parts) -> dict[str, Any]:
         },
         "contexts": {
             **{name: context(outcome, name) for name in outcome.filters if name != RECURSIVE},
-            "ekf_told": {**context(result.known, "ekf_told"), "note": "a second network, other draws"},
+            "ekf_known": {**context(result.known, "ekf_known"), "note": "a second network, other draws"},
         },
         "growth": growth_numbers(result),
         "index": {

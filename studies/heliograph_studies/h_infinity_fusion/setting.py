@@ -138,7 +138,7 @@ class Setting:
         return hg.hop(1.0, noise, power=self.powers[link])
 
     def known(self, link: int, noise: Noise) -> hg.random_affine.AbstractRandomAffine:
-        """The same, lost as often, and the receiver is told."""
+        """The same, lost as often, and the receiver knows it."""
         return hg.erasure(self.lossless(link, noise), self.arrival[link])
 
     def channel(self, noises: Sequence[Noise], hop: Hop | None = None) -> hg.random_affine.AbstractRandomAffine:

@@ -38,7 +38,7 @@ def _designs(result: Parts) -> list[Statement]:
             {"fewest_steps_certified": min(steps), "steps": result.setting.steps},
             lambda fewest_steps_certified, steps: holds(fewest_steps_certified == steps)),
         Statement("the levels measure how well the filters reject disturbances", "Section IV", "1.7 to 1.9",
-            f"K = 0, which hears nothing, has {zero[0]:.6f} at every node; the smallest levels over the horizon are "
+            f"K = 0, which receives nothing, has {zero[0]:.6f} at every node; the smallest levels over the horizon are "
             f"{listed(horizon)}, {min(ratio):.0f} to {max(ratio):.0f} times below the paper's (recursive: "
             f"{listed(smallest)}; with P_0 = 10 I, {result.readings.fixed_start:.5f} for all, by (19) alone)",
             {"level_of_receiving_nothing": max(zero), "least_level": min(result.setting.levels)},
@@ -140,13 +140,13 @@ def _second(result: Parts) -> list[Statement]:
                 not statistics.at_most(guaranteed) and not ignoring.at_most(guaranteed))),
         Statement("it errs less under a resonant disturbance", OURS, "",
             f"mean fused error {_pair(resonant['horizon'])}; Kalman filters {_pair(resonant['ekf_statistics'])} "
-            f"(statistics), {_pair(resonant['ekf_told'])} (told)",
-            {"difference": _difference(resonant["horizon"], resonant["ekf_told"])},
+            f"(statistics), {_pair(resonant['ekf_known'])} (informed)",
+            {"difference": _difference(resonant["horizon"], resonant["ekf_known"])},
             lambda difference: holds(difference.below(0))),
         Statement("it errs less under white noise", OURS, "",
             f"{_pair(white['horizon'])} against {_pair(white['ekf_statistics'])}; the recursive design "
             f"{_pair(white['recursive'])}. Node {NODE} alone: {_pair(alone['horizon'])}, Kalman filter "
-            f"{_pair(alone['ekf_statistics'])}, nothing heard {_pair(alone['zero_gain'])}",
+            f"{_pair(alone['ekf_statistics'])}, nothing received {_pair(alone['zero_gain'])}",
             {"difference": _difference(white["horizon"], white["ekf_statistics"])},
             lambda difference: holds(difference.below(0))),
         Statement("it errs less under a constant bias", OURS, "",

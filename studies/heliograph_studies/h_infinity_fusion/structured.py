@@ -1,4 +1,4 @@
-"""A second example, of ours, that tells filters apart: a lightly damped rotation heard through noisy, lossy relays.
+"""A second example, of ours, that tells filters apart: a lightly damped rotation received through noisy, lossy relays.
 
 x+ = A x + phi(x) + B v with |eig A| = 0.97 and |phi(x) - phi(xhat)| <= 0.05 |x - xhat|; here measurements matter, and
 so does what a filter is designed for.

@@ -150,7 +150,7 @@ def links(setting: Setting) -> dict[str, Any]:
 
 
 def patterns(setting: Setting, critical: dict[str, CriticalArrival]) -> dict[str, Any]:
-    """What happens between and below the conditions, without being told, in floating point, and over arrivals."""
+    """What happens between and below the conditions, with unobserved losses, in floating point, and over arrivals."""
     low, turning = critical["scalar"].lower - 0.06, critical["turning"]
     return {
         "between": over_patterns(setting.coupled, setting.between, setting.patterns),

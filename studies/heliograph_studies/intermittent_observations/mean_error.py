@@ -1,4 +1,4 @@
-"""E P of the filter that is told of losses: by quadrature, from runs, over all patterns; and its Riccati equation."""
+"""E P of the filter that knows of losses: by quadrature, from runs, over all patterns; and its Riccati equation."""
 
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarra
         following_loss = a @ before_loss @ a.T + lost * q
         return np.asarray(np.trace(before_loss + (1 - fail) * received + recover * following_loss, axis1=1, axis2=2))
 
-    result = total(following.mean(axis=1))  # linear in what was heard, so that each run gives one value
+    result = total(following.mean(axis=1))  # linear in what was received, so that each run gives one value
     return Simulated(float(result.mean()), float(result.std(ddof=1) / np.sqrt(len(result))))
 
 

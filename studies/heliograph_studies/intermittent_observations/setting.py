@@ -7,7 +7,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 
-NODE, FILTER = "receiver", "told"
+NODE, FILTER = "receiver", "informed"
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Example:
         return hg.LinearSensor(self.output, self.noise * np.eye(len(self.output)))
 
     def network(self, link: hg.random_affine.AbstractRandomAffine) -> hg.Network:
-        """A receiver that is told what is lost, and skips it."""
+        """A receiver that knows what is lost, and skips it."""
         known = hg.kalman_filter(self.plant(), self.sensor())
         return hg.Network(self.plant(), {NODE: hg.Node(self.sensor(), link, {FILTER: known})})
 

@@ -135,7 +135,7 @@ def _meeting(result: Outcome) -> list[Statement]:
             {"between": shrinking, "below": growing},
             lambda between, below: holds(between < SHRINKS and below > 1)),
         Statement("The lower condition is the truth for every plant", "taken for granted at times", "1 - 1/ρ²",
-            "turned by 90 degrees a step and heard in one coordinate, 1.3 times larger each time: arrival "
+            "turned by 90 degrees a step and received in one coordinate, 1.3 times larger each time: arrival "
             f"{sum(result.critical['turning'][:2]) / 2:.3f} lies above it, and the increments of E tr P over two steps "
             f"grow by {turning:.3f}", {"turning": turning}, lambda turning: holds(turning < SHRINKS)),
     ]  # fmt: skip
@@ -196,12 +196,12 @@ def _errata(result: Outcome) -> list[Statement]:
             f"skew part, which is rounding, is measured by nothing and grows by {it.skew_growth:.4f} a step; as a sum "
             f"of squares {it.joseph[-1]:.6g}, right to {right:.1g}", {"relative_error": wrong},
             lambda relative_error: holds(relative_error < THRESHOLD)),
-        Statement("The steady gain of the filter that hears everything is as stable as the filter that is told",
+        Statement("The steady gain of the filter that receives everything is as stable as the filter that is informed",
             "taken for granted at times", "same threshold",
-            f"it needs {constant.upper:.4f}, the filter that is told {scalar.upper:.4f}",
+            f"it needs {constant.upper:.4f}, the filter that is informed {scalar.upper:.4f}",
             {"fixed_gain": constant.upper, "known": scalar.upper},
             lambda fixed_gain, known: holds(fixed_gain - known < THRESHOLD)),
-        Statement("Losses that the receiver is not told have a critical probability too", "taken for granted at times",
+        Statement("Losses that are not observed have a critical probability too", "taken for granted at times",
             "a threshold", unknown_losses,
             {"impossible": float(sum(item.verdict == "impossible" for item in result.unknown_losses.values()))},
             lambda impossible: holds(impossible == 0)),

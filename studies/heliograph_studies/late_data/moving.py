@@ -62,7 +62,7 @@ def world(packets: Packets, duration: float, seed: int) -> tuple[list[Event], np
     for i in range(len(local)):
         name = packets.node[i], packets.sequence[i], packets.sent[i]
         place = np.searchsorted(times, packets.sent[i])
-        number = (int(packets.node[i]) << 16) + int(packets.sequence[i])  # one node hears them all
+        number = (int(packets.node[i]) << 16) + int(packets.sequence[i])  # one node receives them all
         events.append(
             Event("root", number, float(packets.sent[i]), path[place] + noise[name], float(packets.received[i]))
         )

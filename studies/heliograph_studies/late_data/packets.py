@@ -10,7 +10,7 @@ RESTART = 3
 
 @dataclass(frozen=True)
 class Packets:
-    """One entry for each packet that was heard, in the order of hearing, copies too.
+    """One entry for each packet that was received, in the order of arrival, copies too.
 
     Shapes (packet,): node and sequence, whole numbers; sent and received in seconds since the first was sent.
     """
@@ -64,8 +64,8 @@ class Statistics:
     """What is known of a network from its packets; shares are of one.
 
     lost: of those sent; runs of losses, their mean and the longest; lost_after_lost: of those after a loss.
-    out_of_order: of those heard, after one that was sent later, from anywhere or from their own node. copies: of all
-    that was heard. delay: median, 95 % and largest, seconds. interval: between packets of a node, seconds.
+    out_of_order: of those received, after one that was sent later, from anywhere or from their own node. copies: of all
+    that was received. delay: median, 95 % and largest, seconds. interval: between packets of a node, seconds.
     """
 
     packets: int
@@ -112,7 +112,7 @@ def statistics(packets: Packets) -> Statistics:
 
 
 def _overtaken(sent: np.ndarray) -> np.ndarray:
-    """Of all but the first: whether one that was sent later was heard before."""
+    """Of all but the first: whether one that was sent later was received before."""
     return sent[1:] < np.maximum.accumulate(sent)[:-1]
 
 

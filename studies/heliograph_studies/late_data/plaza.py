@@ -33,7 +33,7 @@ def drift(u: jax.Array) -> jax.Array:
 
 @cache
 def network() -> hg.Network:
-    """The robot's own filter, which hears ranges that come through the network, started where the truth does."""
+    """The robot's own filter, which receives ranges that come through the network, started where the truth does."""
     start = np.diag(robot.START_DEVIATION**2)
     plant = hg.Plant(move, drift, DRIVE.start, start, ("x", "y", "heading"), ("speed", "turn_rate", "dt"))
     sensor = hg.Sensor(robot.ranges(DRIVE.beacons), robot.RANGE_VARIANCE, [f"range_{i}" for i in range(1, 5)])
@@ -55,9 +55,9 @@ def odometry(recording: PlazaRecording) -> list[Event]:
 
 
 def ranges(recording: PlazaRecording, packets: Packets) -> tuple[list[Event], int]:
-    """Each range as it was heard, and how many never were.
+    """Each range as it was received, and how many never were.
 
-    The beacons stand for the nodes that were heard most; the k-th range of a beacon has the fate of the k-th packet of
+    The beacons stand for the most received nodes; the k-th range of a beacon has the fate of the k-th packet of
     its node, from the first again after the last.
     """
     fates = fates_by_node(packets)
@@ -74,7 +74,7 @@ def ranges(recording: PlazaRecording, packets: Packets) -> tuple[list[Event], in
 
 
 def fates_by_node(packets: Packets) -> Sequence[np.ndarray]:
-    """Delays of each node's packets, NaN for lost ones, one boot after another; those heard most come first."""
+    """Delays of each node's packets, NaN for lost ones, one boot after another; those received most come first."""
     by_node: dict[int, list[np.ndarray]] = {}
     for part, fate in zip(packets.boots(), packets.fates(), strict=True):
         by_node.setdefault(int(part.node[0]), []).append(fate)

@@ -25,7 +25,7 @@ class Estimated:
 
 
 def arrival_of(event: Event) -> float:
-    """When an event was heard."""
+    """When an event was received."""
     return event.time if event.arrival is None else event.arrival
 
 
@@ -63,7 +63,7 @@ def _played(
 ) -> tuple[dict[str, Estimated], dict[str, int]]:
     """Estimates of now, and of `lags` before, at each moment; and the verdicts on what the first node sent."""
     timeline, expected = Timeline(network, window), {} if lags is None else lags
-    coming = sorted(events, key=arrival_of)  # stable: else as they were heard
+    coming = sorted(events, key=arrival_of)  # stable: else as they were received
     node, at = network.names[0], 0
     result: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *expected)}
     for moment in moments:

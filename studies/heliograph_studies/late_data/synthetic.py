@@ -1,7 +1,7 @@
 """A network with the statistics of a recorded one, where no recording is at hand.
 
 They are those of the log "tdma 3-1": 10 nodes, a packet of each some 4.8 s apart, 9.9 % lost, 27 % of those that follow
-a loss, 15 % of what is heard copies, and quantiles of the delay. Here delays are independent, and losses a chain.
+a loss, 15 % of what is received copies, and quantiles of the delay. Here delays are independent, and losses a chain.
 
 Source: Vilgelm, Gürsu, Zoppi, Kellerer, Time slotted channel hopping for smart metering (2016), the data beside it.
 """
@@ -19,7 +19,7 @@ DELAYS = (0.015, 0.075, 0.21, 0.38, 0.65, 1.2, 2.2, 4.2, 5.9, 7.8, 23.0, 85.0)  
 
 
 def synthetic_packets(duration: float, seed: int) -> Packets:
-    """Packets sent during so many seconds, in the order of hearing."""
+    """Packets sent during so many seconds, in the order of arrival."""
     generator = np.random.default_rng(seed)
     parts = [_node(node, duration, generator) for node in range(2, NODES + 2)]
     node, sequence, sent, received = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -31,7 +31,7 @@ def synthetic_packets(duration: float, seed: int) -> Packets:
 
 
 def _node(node: int, duration: float, generator: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """What is heard of one node."""
+    """What is received of one node."""
     count = int(duration / INTERVAL)
     sent = (np.arange(count) + generator.random(count)) * INTERVAL
     begin = LOST * (1 - LOST_AFTER_LOST) / (1 - LOST)  # of a loss after none, so that LOST of all are lost

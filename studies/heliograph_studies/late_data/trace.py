@@ -1,7 +1,7 @@
-"""A reader for logs of a TSCH testbed: packets as the root of a time-slotted radio network heard them.
+"""A reader for logs of a TSCH testbed: packets as the root of a time-slotted radio network received them.
 
 A row is 38 bytes as a list, a tab, and the host's time, which drifts and is not used. Numbers have their lowest byte
-first: [1:6] the slot in which the packet was heard, [6:11] that in which it was sent, [11:13] its sequence number,
+first: [1:6] the slot in which the packet was received, [6:11] that in which it was sent, [11:13] its sequence number,
 [14:38] up to six hops of four bytes (address, tries, channel, signal strength; address 0: none). The first hop is the
 node that sent it.
 
@@ -23,7 +23,7 @@ ROW = re.compile(r"\[\s*([0-9]{1,3}(?:\s*,\s*[0-9]{1,3})*)\s*\]\t.*")
 
 
 def read_trace(path: str | Path) -> tuple[Packets, int]:
-    """The packets of a log, and the number of rows that are none: cut off, or heard before they were sent.
+    """The packets of a log, and the number of rows that are none: cut off, or received before they were sent.
 
     Raises:
         ValueError: no such file, no text, or no packet in it.
@@ -46,7 +46,7 @@ def read_trace(path: str | Path) -> tuple[Packets, int]:
 
 
 def _row(line: str) -> tuple[int, int, int, int] | None:
-    """Node, sequence, and slots of sending and hearing; None if it is no packet."""
+    """Node, sequence, and slots of sending and arrival; None if it is no packet."""
     match = ROW.fullmatch(line.strip())
     result = [] if match is None else [int(part) for part in match[1].split(",")]
     if len(result) != BYTES or max(result) > 255:

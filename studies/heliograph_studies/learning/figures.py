@@ -15,7 +15,7 @@ LABELS = {
     "rare": "rare, large gains",
     "rayleigh_short": "Rayleigh, 500 steps",
     "two_point_undriven": "two gains, no input",
-    "untold": "untold losses",
+    "uninformed": "unobserved losses",
 }
 COLOURS = {"hessian": VERMILION, "white": AMBER, "bartlett": PURPLE, "cosines": BLUE}
 

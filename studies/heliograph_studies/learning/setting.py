@@ -1,4 +1,4 @@
-"""The example's links: one plant, one sensor heard through a relay and directly, under four laws of the gain."""
+"""The example's links: one plant, one sensor received through a relay and directly, under four laws of the gain."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from heliograph.numerics.check import check_count, check_seed
 
 MEAN, VARIANCE = 0.8, 0.16
 PLANT_NOISE, SENSOR_NOISE, HOP_NOISE, DIRECT_NOISE = 0.2, 0.3, 0.3, 0.2
-ARRIVAL = 0.8  # told
+ARRIVAL = 0.8  # observed
 UNTOLD = 0.7
 STEPS, SHORT = 2000, 500
 PERIOD, LEVEL = 60, 0.4  # of the input, a square wave
@@ -60,7 +60,7 @@ ROWS = (
     *(Row(law, law, form, STEPS) for law in LAWS for form in FORMS),
     Row("rayleigh_short", "rayleigh", "linear", SHORT),
     Row("two_point_undriven", "two_point", "conditional", STEPS, driven=False),
-    *(Row("untold", "untold", form, STEPS) for form in FORMS),
+    *(Row("uninformed", "uninformed", form, STEPS) for form in FORMS),
 )
 
 
@@ -72,7 +72,7 @@ def square_wave(row: Row) -> np.ndarray:
 
 def world(row: Row) -> hg.Network:
     """The network that is recorded."""
-    if row.law == "untold":
+    if row.law == "uninformed":
         return unpublished(PLANT_NOISE, HOP_NOISE, UNTOLD)
     return relayed(LAWS[row.law], PLANT_NOISE, SENSOR_NOISE, HOP_NOISE)
 
@@ -80,7 +80,7 @@ def world(row: Row) -> hg.Network:
 def learned(row: Row) -> hg.Network:
     """What is learned of it."""
     plant_noise, hop_noise = hg.free(PLANT_NOISE, "plant_noise"), hg.free(HOP_NOISE, "hop_noise")
-    if row.law == "untold":
+    if row.law == "uninformed":
         return unpublished(plant_noise, hop_noise, hg.free(UNTOLD, "arrival"))
     mean, variance = hg.free(MEAN, "mean_gain"), hg.free(true_values(row)["gain_variance"], "gain_variance", "positive")
     law = hg.random_affine.GivenMoments([mean, mean**2 + variance])
@@ -90,7 +90,7 @@ def learned(row: Row) -> hg.Network:
 def true_values(row: Row) -> dict[str, float]:
     """What is to be covered, by name."""
     noises = {"plant_noise": PLANT_NOISE, "hop_noise": HOP_NOISE}
-    if row.law == "untold":
+    if row.law == "uninformed":
         return {**noises, "arrival": UNTOLD}
     law = LAWS[row.law]
     variance = float(law.moment(2)) - float(law.moment(1)) ** 2
@@ -98,7 +98,7 @@ def true_values(row: Row) -> dict[str, float]:
 
 
 def relayed(law: hg.random_affine.AbstractLaw, plant_noise: float, sensor_noise: float, hop_noise: float) -> hg.Network:
-    """z1 = g y + n1 of which a part is lost and told, z2 = y + n2 with n2 known."""
+    """z1 = g y + n1 of which a part is lost and observed, z2 = y + n2 with n2 known."""
     hop = hg.erasure(hg.hop(law, hop_noise), ARRIVAL)
     return _network(plant_noise, sensor_noise, hg.model.with_direct_link(hop, hg.hop(1.0, DIRECT_NOISE)))
 

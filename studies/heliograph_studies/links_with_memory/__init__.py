@@ -1,4 +1,4 @@
-"""Links that fade slowly: what a filter without memory claims and errs, what memory and being told are worth."""
+"""Links that fade slowly: what a filter without memory claims and errs, what memory and side information are worth."""
 
 from heliograph_studies.links_with_memory import compute, figures
 from heliograph_studies.links_with_memory.setting import Setting as Setting

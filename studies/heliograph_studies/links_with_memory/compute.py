@@ -89,7 +89,7 @@ def scores(
         "gpb2": hg.filters.gpb2_filter(*model),
     }
     places: Places = {
-        "nothing told": (channel, {**linear, **weighing}),
+        "nothing known": (channel, {**linear, **weighing}),
         "late": (hg.model.with_flag(channel, late=True), {"mode_late": hg.filters.mode_late_filter(*model)}),
         "now": (hg.model.with_flag(channel), {"mode_known": hg.filters.mode_known_filter(*model)}),
     }
@@ -129,7 +129,7 @@ def simulated(
 
 
 def with_side_information(setting: Setting, progress: Progress) -> dict[str, Score]:
-    """Fading in bursts: losses that depend on the mode and are told, and classes of the signal's strength."""
+    """Fading in bursts: losses that depend on the mode and are observed, and classes of the signal's strength."""
     channel, losing = bursts(setting), models.lossy(setting)
     by_class = hg.filters.side_information_filter(PLANT, SENSOR, channel, models.CLASSES)
     places: Places = {

@@ -14,11 +14,11 @@ ROWS = {  # filter: how it is called, and its colour
     "imm": ("a Gaussian per mode (IMM)", PURPLE),
     "gpb2": ("a Gaussian per mode (GPB2)", GREEN),
     "particle": ("particles", MUTED),
-    "mode_late": ("told the mode one step late", INK),
-    "mode_known": ("told the mode", INK),
+    "mode_late": ("knows the mode one step late", INK),
+    "mode_known": ("knows the mode", INK),
 }
 CLAIMING = {"memoryless": "no memory", "exact": "linear, modes", "gpb2": "GPB2"}
-INFORMED = {"exact": ("nothing told", BLUE), "mode_late": ("one step late", PURPLE), "mode_known": ("mode known", INK)}
+INFORMED = {"exact": ("nothing known", BLUE), "mode_late": ("one step late", PURPLE), "mode_known": ("mode known", INK)}
 
 
 def figures(outcome: Outcome) -> dict[str, Figure]:

@@ -60,7 +60,7 @@ class Outcome:
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Run everything, each stage in a folder that goes with it."""
-    find_server()  # what is missing is told before the work starts
+    find_server()  # what is missing is reported before the work starts
     drive = read_drive(setting.seed)
     alone, links = stages("left alone", lambda: of_alone(drive))
     restarted, after = stages("killed and started again", lambda: of_killed(drive, len(alone), setting, stages))

@@ -24,7 +24,7 @@ from heliograph_studies.live.server import Server, free_port
 
 WINDOW = 10.0  # s
 TOPIC = "live"
-SOON = 0.3  # s, within which it is killed once it has told enough
+SOON = 0.3  # s, within which it is killed once it has published enough
 PATIENCE = 240.0  # s, for a service that starts and compiles on a busy machine
 TOGETHER = 20  # messages that are sent before others may work
 ALONE, KILLED = "alone.sqlite", "killed.sqlite"
@@ -35,7 +35,7 @@ Screenshots = dict[str, bytes]  # PNG files by name
 
 @dataclass(frozen=True)
 class Killed:
-    """Final estimates as text, one a line, in the order in which they were told; the page as a browser drew it."""
+    """Final estimates as text, one a line, in the order in which they were published; the page as a browser drew it."""
 
     finals: list[bytes]
     kills: int
@@ -57,7 +57,7 @@ def left_alone(folder: Path, lines: Sequence[bytes]) -> list[bytes]:
 
 
 def finals(bodies: Iterable[bytes]) -> list[bytes]:
-    """Final estimates without the number that tells copies apart; what was told again counts once."""
+    """Final estimates without the number that tells copies apart; what was published again counts once."""
     results: dict[int, bytes] = {}
     for body in bodies:
         if b'"kind":"final"' in body:
@@ -174,7 +174,7 @@ async def _reads(client: Client) -> bool:
 
 
 async def _finals_read(client: Client, count: int) -> bool:
-    """Whether so many final estimates were told."""
+    """Whether so many final estimates were published."""
     try:
         info = await client.jetstream(timeout=60).stream_info(f"{TOPIC}-out", subjects_filter=f"{TOPIC}.out.final.*")
     except NotFoundError:

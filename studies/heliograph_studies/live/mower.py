@@ -35,7 +35,7 @@ def read_drive(seed: int) -> Drive:
     """The recorded odometry at once, and each range with the delay or the loss of a packet of a radio network."""
     recording = read_recording()
     received, unreceived = plaza.ranges(recording, synthetic_packets(RADIO, seed))
-    coming = sorted([*plaza.odometry(recording), *received], key=arrival_of)  # stable: else as they were heard
+    coming = sorted([*plaza.odometry(recording), *received], key=arrival_of)  # stable: else as they were received
     return Drive(recording, [line(event) for event in coming], unreceived)
 
 

@@ -51,7 +51,7 @@ class Counted:
         return outputs
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """As the service does; the last batch is over when it was told."""
+        """As the service does; the last batch is over when it was published."""
         self.service.published(outputs)
         self.ended = perf_counter()
         if self.left <= 0:
@@ -74,7 +74,7 @@ def in_memory(lanes: Lanes, options: Options, lines: Sequence[bytes]) -> float:
 async def through(
     kind: str, folder: Path, server: Server, lanes: Lanes, options: Options, lines: Sequence[bytes]
 ) -> float:
-    """Steps a second through a broker that has the messages already, estimates told to it, commits on disk."""
+    """Steps a second through a broker that has the messages already, estimates published to it, commits on disk."""
     where = address(f"{kind}://127.0.0.1:{getattr(server, kind)}/speed-{kind}", {})
     await _subscribed(where)
     await (_sent(where, lines) if kind == "nats" else asyncio.to_thread(_published, where, lines))

@@ -1,4 +1,4 @@
-"""Flux and speed of an induction machine that gym-electric-motor simulates, its currents heard through relays."""
+"""Flux and speed of an induction machine that gym-electric-motor simulates, its currents received through relays."""
 
 from heliograph_studies.motor_drive import compute, figures
 from heliograph_studies.motor_drive.compute import Setting as Setting

@@ -1,4 +1,4 @@
-"""Who hears the stator currents: two nodes behind relays, one by wire, and the filters at each."""
+"""Who receives the stator currents: two nodes behind relays, one by wire, and the filters at each."""
 
 from zlib import crc32
 
@@ -52,7 +52,7 @@ def network(plant: hg.Plant) -> hg.Network:
 
 
 def received(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """What reaches each node (steps, 2) in A; the three hear one machine, each with its own sensor and channel."""
+    """What reaches each node (steps, 2) in A; the three receive one machine, each with its own sensor and channel."""
     sensor = currents(truth.shape[1])
     return {
         name: np.asarray(_send(sensor, channel, truth, seed, crc32(name.encode())))

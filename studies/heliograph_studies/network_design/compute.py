@@ -102,7 +102,7 @@ def demonstration(setting: Setting, stages: Stages) -> dict[str, Design]:
 
 
 def schedules(setting: Setting) -> Schedules:
-    """Who of the six sensors sends when, heard directly, and how seldom over two hops."""
+    """Who of the six sensors sends when, received directly, and how seldom over two hops."""
     paths = hg.planning.paths_of(models.six(False), hg.planning.Error())[0]
     turns = theory.best_schedule(paths, setting.on, setting.periods)
     bursts = theory.burst_sending(models.slow_state(), 0.5)

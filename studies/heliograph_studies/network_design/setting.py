@@ -64,7 +64,7 @@ def gain(kappa: float, length: float) -> hg.Discrete:
 
 
 def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
-    """Three states, and these of the six sensors, heard directly or each through a relay of its own."""
+    """Three states, and these of the six sensors, received directly or each through a relay of its own."""
     nodes = {}
     for i, name in enumerate(NAMES):
         hops = [hg.hop(gain(RELAYED_KAPPA if relayed else KAPPA[i], NEAR[i]), 1.0)]
@@ -77,12 +77,12 @@ def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
 
 
 def slow_state() -> Paths:
-    """A state that hardly moves, heard over two hops without fading."""
+    """A state that hardly moves, received over two hops without fading."""
     return hg.planning.independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
 
 
 def circuit() -> hg.model.RelayNetwork:
-    """Two relays in turn that filter and forward what they hear of a circuit, as published."""
+    """Two relays in turn that filter and forward what they receive of a circuit, as published."""
     drive = np.array([[0.6], [0.5], [0.3]])
     plant = hg.LinearPlant(
         [[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]],

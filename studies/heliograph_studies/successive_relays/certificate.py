@@ -161,7 +161,7 @@ def _link_constants(
 
 
 def _structure(c: dict[str, float]) -> Assumption:
-    text = "each relay hears the sensor and one other relay, the receiver one relay, over scalar gains"
+    text = "each relay receives the sensor and one other relay, the receiver one relay, over scalar gains"
     return Assumption(text, "otherwise" if np.isnan(c["mu_upper"]) else "so", not np.isnan(c["mu_upper"]))
 
 

@@ -156,7 +156,7 @@ def _behind(network: hg.model.RelayNetwork, gains: GainsByFilter) -> Steady:
 
 
 def _without_relay(setting: Setting, direct: hg.random_affine.GainAndNoise) -> Steady:
-    """Trace of the error of x_(k+1) predicted from what was heard up to k: as late as behind a relay."""
+    """Trace of the error of x_(k+1) predicted from what was received up to k: as late as behind a relay."""
     filtered = hg.relays.periodic_own_error_design(setting.without_relays(direct)).covariance["receiver"][-1]
     a = setting.transition
     value = float(np.trace(a @ filtered @ a.T + setting.process_covariance))
@@ -164,7 +164,7 @@ def _without_relay(setting: Setting, direct: hg.random_affine.GainAndNoise) -> S
 
 
 def limits(setting: Setting) -> dict[str, float]:
-    """Other steady traces to compare with: filtered without relays, and nothing heard."""
+    """Other steady traces to compare with: filtered without relays, and nothing received."""
     filtered = {
         name: float(hg.relays.periodic_own_error_design(setting.without_relays(direct)).trace("receiver")[-1])
         for name, direct in (("no_relay_filtered", setting.link(1)), ("sensor_itself_filtered", hg.perfect()))
@@ -172,7 +172,7 @@ def limits(setting: Setting) -> dict[str, float]:
     covariance, a = setting.initial_covariance, setting.transition
     for _ in range(setting.steady):
         covariance = a @ covariance @ a.T + setting.process_covariance
-    return {**filtered, "nothing_heard": float(np.trace(covariance))}
+    return {**filtered, "nothing_received": float(np.trace(covariance))}
 
 
 def misprinted(name: str, setting: Setting, right: Recursion) -> Misprinted:
@@ -190,7 +190,7 @@ def world(network: hg.model.RelayNetwork, design: RelayDesign) -> hg.Network:
     """The relays with their filters, and the receiver's."""
     schedules = hg.relays.relay_schedules(network, design)
     receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
-    return hg.Network.of_relays(network, schedules, {"own": receiver})
+    return hg.Network.of_relays(network, schedules, {"local": receiver})
 
 
 def initial_states(setting: Setting) -> np.ndarray:
@@ -210,7 +210,7 @@ def simulate(setting: Setting, design: RelayDesign, stages: Stages) -> Simulated
     start = np.sum((initial_states(setting) - network.initial()[0]) ** 2, axis=1)
     mean, error = {}, {}
     for name in FILTERS:
-        statistics = sums[name]["own"]
+        statistics = sums[name]["local"]
         batches = np.trace(statistics.outer, axis1=2, axis2=3) / statistics.count[:, None]
         weights = statistics.count / statistics.count.sum()
         mean[name] = np.concatenate([[start.mean()], weights @ batches])

@@ -19,7 +19,7 @@ TITLES = {
     "lmmse_tuned": "the same, searched from another start", "lmmse_quiet": "the same, at the paper's power",
     "no_relay": "no relay: one hop, as late", "sensor_itself": "no relay, no channel: as late",
     "no_relay_filtered": "no relay: one hop, without delay",
-    "sensor_itself_filtered": "no relay, no channel: without delay", "nothing_heard": "nothing heard",
+    "sensor_itself_filtered": "no relay, no channel: without delay", "nothing_received": "nothing received",
 }  # fmt: skip
 UNITS = ("V", "V", "A")
 
@@ -36,7 +36,9 @@ def _trajectory(result: Outcome, i: int) -> Figure:
     assert result.shown.truth is not None
     curves = [Curve("true", INK, result.shown.truth[0, :, i])]
     for name in FILTERS:
-        curves.append(Curve(LABELS[name], COLOURS[name], np.asarray(result.shown.estimates[name]["own"].mean)[0, :, i]))
+        curves.append(
+            Curve(LABELS[name], COLOURS[name], np.asarray(result.shown.estimates[name]["local"].mean)[0, :, i])
+        )
     label = f"{STATES[i].replace('_', ' ')} ({UNITS[i]})"
     return curves_over_time(result.shown.time, [Panel(label, curves)], "step k")
 

@@ -67,7 +67,7 @@ def _alternating(
 
 
 def _largest_noise() -> float:
-    """Smallest eigenvalue of Xi_1 at k = 40 where relays hear next to nothing and noise is unequal."""
+    """Smallest eigenvalue of Xi_1 at k = 40 where relays receive next to nothing and noise is unequal."""
     plant = hg.LinearPlant(0.1 * np.eye(2), np.diag([0.01, 1.0]), np.zeros(2), 0.01 * np.eye(2))
     sensor = hg.LinearSensor([[1.0, 1.0]], [[1.0]])
     network = _alternating(plant, sensor, shadowing(0.5, 0.1), 1e6, 1e6)

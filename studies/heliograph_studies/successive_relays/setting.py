@@ -97,5 +97,5 @@ class Setting:
         return hg.model.RelayNetwork(self.plant(), self.sensor(), ("relay_1", "relay_2"), (odd, even))
 
     def without_relays(self, direct: hg.random_affine.GainAndNoise) -> hg.model.RelayNetwork:
-        """A receiver that hears the sensor itself."""
+        """A receiver of the sensor itself."""
         return hg.model.RelayNetwork(self.plant(), self.sensor(), (), ({"receiver": {"sensor": direct}},))

@@ -11,7 +11,7 @@ from heliograph_studies.successive_relays.certificate import Bound, RelayCertifi
 from heliograph_studies.successive_relays.compute import FILTERS, Outcome
 from heliograph_studies.successive_relays.misprints import circuit, misprints, proofs
 
-FALSE_ALARM = 1e-3  # that some step of a right design is told to disagree with the simulation
+FALSE_ALARM = 1e-3  # that some step of a right design is said to disagree with the simulation
 BATCHES = 50
 ROUNDING = 1e-9  # relative, of moments followed over many steps
 LITTLE = 0.05  # a relative difference that does not matter
@@ -98,9 +98,9 @@ def _estimates(result: Outcome) -> list[Statement]:
     return [
         Statement("the estimates track the state", "Section IV, Figs. 2 to 4", "competent",
             f"rms error / rms state {_relative(result, 10):.3f} at k = 10, {_relative(result, 50):.3f} at 50, "
-            f"{_relative(result, 100):.3f} at 100; tr P / tr(nothing heard) {trace[2] / state[2]:.2f} at k = 2, "
-            f"{trace[10] / state[10]:.3f} at 10, {total['paper'] / 2 / result.limits['nothing_heard']:.3f} steady",
-            {**track, "steady_over_nothing_received": total["paper"] / 2 / result.limits["nothing_heard"]},
+            f"{_relative(result, 100):.3f} at 100; tr P / tr(nothing received) {trace[2] / state[2]:.2f} at k = 2, "
+            f"{trace[10] / state[10]:.3f} at 10, {total['paper'] / 2 / result.limits['nothing_received']:.3f} steady",
+            {**track, "steady_over_nothing_received": total["paper"] / 2 / result.limits["nothing_received"]},
             lambda relative_error_at_10, relative_error_at_50, relative_error_at_100, steady_over_nothing_received:
             holds(
                 max(relative_error_at_10, relative_error_at_50, relative_error_at_100) < 1 / 2

@@ -138,12 +138,11 @@ def _drive(
 def turning_points(name: str, truth: np.ndarray) -> tuple[float, float]:
     """From the far end to the return, as published: A from x > 49.3, y > -5 to x <= 12, y > 3.4; B within x and y."""
     time, x, y = truth[:, 0], truth[:, 1], truth[:, 2]
-    kind = name.rsplit("_", 1)[-1][:1]
-    if kind == "a":
-        starts = np.flatnonzero((x > 49.3) & (y > -5))
-        ends = np.flatnonzero((x <= 12) & (y > 3.4))
+    (far, low), (near, high) = WINDOWS.get(name.rsplit("_", 1)[-1][:1], WINDOWS["b"])
+    if far > near:
+        starts, ends = np.flatnonzero((x > far) & (y > low)), np.flatnonzero((x <= near) & (y > high))
     else:
-        starts, ends = np.flatnonzero((x < 8.6) & (y < -7)), np.flatnonzero((x > 8.6) & (y < -7))
+        starts, ends = np.flatnonzero((x < far) & (y < low)), np.flatnonzero((x > near) & (y < high))
     if len(starts) and len(ends[ends > starts[0]]):
         return float(time[starts[0]]), float(time[ends[ends > starts[0]][0]])
     return float(time[0]), float(time[-1])

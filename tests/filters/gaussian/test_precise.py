@@ -87,7 +87,7 @@ WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
 def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
     """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
 
-    A variance that is told is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is told to 1e-3.
+    A claimed variance is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is claimed to 1e-3.
     """
     noise = [[1e-9, 0.0], [0.0, 1e-9]]
     lost = 0
@@ -186,7 +186,7 @@ def test_more_precise_outputs_than_are_unrolled():
 
 
 def test_a_noise_free_output_has_a_gradient():
-    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not heard too."""
+    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not received too."""
 
     def mean(wide):
         plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))
@@ -278,3 +278,26 @@ def test_the_covariance_of_an_unstable_plant_held_by_its_inputs_stays(make):
     expected = np.roots([a**2, r - a**2 * r + q, -q * r]).max()
     np.testing.assert_allclose(moved.covariance[[100, 1000, 2199], 0, 0], expected, rtol=1e-12)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(moved.state))
+
+
+def test_behind_a_random_gain_far_from_zero_a_combination_that_says_nothing_is_left_out():
+    """Three outputs of two states are tied and so is the noise of the random gain, of which 1e-6 is not along the mean.
+
+    What the elimination leaves of the tied combination, 1e-11 of the outputs, is no measurement without noise.
+    """
+    matrix = np.array([[2.5, 0.8], [0.25, -0.65], [1.4, -0.5]])
+    plant = hg.LinearPlant(np.eye(2), 0.0, [1400.0, -50.0], 1.0)
+    item = hg.linear_filter(plant, hg.LinearSensor(matrix, 0.0), hg.dropout(hg.perfect(3), 0.7))
+    state, _ = item.correct(item.predict(item.init()), np.zeros(3))
+    np.testing.assert_allclose(state.covariance, exact_after_dropout(matrix, [1400, -50], 7), rtol=1e-6)
+
+
+def exact_after_dropout(matrix, mean, tenths):
+    """P+ of x with Cov x = I and z = g C x, P(g = 1) = tenths / 10: C^+ z = g x says what z does. In fractions."""
+    p = Fraction(tenths, 10)
+    a, b = (Fraction(x) for x in mean)
+    # S = p^2 I + p (1 - p) (I + m m'), P+ = I - p^2 S^-1.
+    s = [[p + p * (1 - p) * a * a, p * (1 - p) * a * b], [p * (1 - p) * a * b, p + p * (1 - p) * b * b]]
+    det = s[0][0] * s[1][1] - s[0][1] ** 2
+    inverse = [[s[1][1] / det, -s[0][1] / det], [-s[0][1] / det, s[0][0] / det]]
+    return [[float(int(i == j) - p * p * inverse[i][j]) for j in range(2)] for i in range(2)]

@@ -39,7 +39,7 @@ def test_what_a_growing_state_claims_is_its_error(growth, steps):
     for degree in (1, 2):
         item = hg.filters.scheduled_polynomial_filter(plant, sensor, hop, steps, degree)
         assert item.claim == "exact"
-        assert item.inner.covariances[-1, 0, 0] == pytest.approx(p, rel=1e-6)  # what may be lost before it is told
+        assert item.inner.covariances[-1, 0, 0] == pytest.approx(p, rel=1e-6)  # what may be lost before it is seen
 
 
 def test_a_growing_mean_and_a_noise_with_a_mean():

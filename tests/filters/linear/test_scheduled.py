@@ -156,3 +156,27 @@ def test_products_with_the_past_refuse_a_channel_that_remembers():
     burst = hg.gilbert_elliott(s.channel, s.channel, 0.2, 0.4)
     with pytest.raises(ValueError, match=r"^channel of a memory filter: expected one that forgets, got Modes"):
         hg.filters.memory_filter(s.plant, s.sensor, burst, HORIZON)
+
+
+def test_far_from_zero_products_with_the_past_keep_their_digits():
+    """Behind a known gain they are those of x - E[x]: the same covariances at a mean of 1,000 as at none."""
+    sensor = hg.LinearSensor([[1.0], [0.5]], [[0.1, 0.0], [0.0, 0.2]])
+    near, far = (
+        hg.filters.memory_filter(hg.LinearPlant([[0.9]], 0.1, [mean], 1.0), sensor, hg.perfect(2), 6)
+        for mean in (0.0, 1000.0)
+    )
+    assert near.claim == far.claim == "exact"
+    np.testing.assert_allclose(far.products.covariances[1:], near.products.covariances[1:], rtol=1e-12)
+    data = np.random.default_rng(0).normal(size=(6, 2))
+    moved = 1000.0 * 0.9 ** np.arange(1, 7)
+    a, b = run(near, data)[0], run(far, data + moved[:, None] * np.array([1.0, 0.5]))[0]
+    np.testing.assert_allclose(b, a + moved[:, None], rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:lmmse")  # rounding is all that is left of these variances
+def test_no_variance_is_negative_where_nothing_is_unknown():
+    """A state seen without noise: zero, where the moments' rounding would leave less than nothing."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.0, [300.0], 1.0), hg.LinearSensor([[0.35], [-0.64]], 0.0)
+    item = hg.filters.memory_filter(plant, sensor, hg.hop(hg.Discrete([1.0], [1.0]), 0.0, dimension=2), 12)
+    claimed = item.products.covariances[1:]
+    assert claimed.min() >= 0 and claimed[1::2].max() < 1e-9

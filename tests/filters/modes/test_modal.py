@@ -92,7 +92,7 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
         BOTH_LAWS, BOTH_CHAINS,
         [Stack([Series([[GOOD, BAD][i], THREE[j]]), [BAD, GOOD][i]]) for i, j in A_AND_B],
     ),
-    "a loss that is not told": (
+    "a loss that is not observed": (
         lambda k: hg.dropout(hg.model.with_direct_link(one_chain(k), RELAY), 0.7), LAW_A, CHAIN_A,
         [hg.dropout(Stack([m, RELAY]), 0.7) for m in (GOOD, BAD)],
     ),

@@ -73,7 +73,7 @@ def steady_law():
 
 @pytest.mark.parametrize(("build", "steps"), [(FILTERS[0], 1), (FILTERS[1], 1), (FILTERS[2], 2)])
 def test_until_something_is_merged_they_are_exact(build, steps):
-    """GPB2 hears with every pair of modes before it merges: its second step is Bayes' rule."""
+    """GPB2 corrects with every pair of modes before it merges: its second step is Bayes' rule."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * steps)
     mean, spread, total = exact(PLANT, SENSOR, link, DATA[:steps])
     result, likelihood = stepped(build(PLANT, SENSOR, LINK), DATA[:steps])
@@ -197,7 +197,7 @@ def test_what_is_merged_early_is_worse_and_claims_too_little(record):
 
 
 def losing(arrival):
-    """Modes that are told apart by what arrives too."""
+    """Modes that differ in what arrives too."""
     modes = [hg.erasure(hg.hop(g, 0.05), p) for g, p in zip((0.2, 1.0), arrival, strict=True)]
     return hg.markov_fading(modes, CHAIN)
 

@@ -1,4 +1,4 @@
-"""Filters that are told something of the modes: limits, all paths of the modes, and simulation."""
+"""Filters that know something of the modes: limits, all paths of the modes, and simulation."""
 
 from itertools import pairwise, product
 
@@ -60,7 +60,7 @@ def test_a_state_far_from_zero_keeps_its_digits():
 
 
 def test_a_state_that_is_known_stays_known():
-    """Far from zero, growing, heard with gains that the mode decides: nothing is left to find out, to the last bit."""
+    """Far from zero, growing, received with gains that the mode decides: nothing is left to find, to the last bit."""
     plant = hg.LinearPlant([[-1.1468]], 0.0, [42.1271], 0.0)
     result = claims(side_information_filter(plant, hg.LinearSensor([[1e5]], 1e-12), LOSSY), Z)
     np.testing.assert_array_equal(result[:, 1], 0.0)
@@ -69,7 +69,7 @@ def test_a_state_that_is_known_stays_known():
 
 @pytest.mark.parametrize("noise", [1e-8, 1e-14, 1e-20])
 def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
-    """Of x heard in noise far below its own: the variance is the noise's, where a difference would be rounding."""
+    """Of x received in noise far below its own: the variance is the noise's, where a difference would be rounding."""
     plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.eye(2), [3.0, 1.0], np.eye(2))
     sensor = hg.LinearSensor([[1.0, 0.0]], 0.0)
     data = np.column_stack([Z, Z[:, 0]])
@@ -158,7 +158,7 @@ TOGETHER = [
 
 @pytest.fixture(scope="module", params=TOGETHER, ids=" and ".join)
 def record(request):
-    """One plant, heard in two ways at once."""
+    """One plant, received in two ways at once."""
     nodes = {}
     for name in request.param:
         world, item, _ = WORLDS[name]

@@ -7,7 +7,7 @@ import heliograph as hg
 from tests.filters.modal_problems import BAD, BURSTS, GOOD, PLANT, SENSOR, bursts, variances
 
 Modes, true_error = hg.random_affine.Modes, hg.filters.true_error
-STEPS = 300  # all that is told of the long run has settled by then
+STEPS = 300  # all that tells of the long run is steady by then
 THREE = np.array([[0.8, 0.15, 0.05], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]])
 
 

@@ -51,7 +51,7 @@ def nees(result, part):
 
 
 def listening(speed, spread):
-    """The sensors of a node with a true clock and of one without; filters that hear both, or the second alone."""
+    """The sensors of a node with a true clock and of one without; filters that receive both, or the second alone."""
     plant, _, joint, channel = seen_by("ab", speed, spread=spread)
     alone = hg.parallel([hg.model.silent(1, 1, 1.0), hg.perfect()])
     blind = hg.LinearSensor(np.tile(np.eye(1, 4), (2, 1)), 0.04 * np.eye(2))

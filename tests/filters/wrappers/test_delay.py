@@ -1,4 +1,4 @@
-"""Links that are late: told, not told and taken as current, against the moments of all that was sent."""
+"""Links that are late: stamped, not stamped and taken as current, against the moments of all that was sent."""
 
 import equinox as eqx
 import jax
@@ -48,14 +48,14 @@ def in_chain(initial, rows):
 @pytest.fixture(scope="module")
 def filters():
     """One of each kind."""
-    chosen = {"untold": UNKNOWN, "told": KNOWN, "fixed": FIXED}
+    chosen = {"uninformed": UNKNOWN, "informed": KNOWN, "fixed": FIXED}
     results = {name: hg.linear_filter(PLANT, SENSOR, channel) for name, channel in chosen.items()}
     return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNKNOWN)}
 
 
 def test_not_told_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
     received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
-    result = true_error(filters["untold"], PLANT, SENSOR, UNKNOWN, STEPS)
+    result = true_error(filters["uninformed"], PLANT, SENSOR, UNKNOWN, STEPS)
     best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, STEPS + 1)])
     np.testing.assert_allclose(result.claimed, best, rtol=1e-11, atol=1e-11 * np.abs(best).max())
     np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
@@ -66,12 +66,12 @@ def test_not_told_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(fi
     np.testing.assert_allclose(wrong.true[-1], oracle.error_of(PARTS, received, weights, offset, STEPS), rtol=1e-10)
     assert wrong.claimed[-1, 0, 0] == pytest.approx(0.199, abs=5e-4)
     assert wrong.true[-1, 0, 0] == pytest.approx(0.896, abs=5e-4)
-    assert [filters[name].claim for name in ("untold", "told", "fixed")] == ["exact"] * 3
+    assert [filters[name].claim for name in ("uninformed", "informed", "fixed")] == ["exact"] * 3
     assert filters["as_current"].claim == "nominal"
 
 
 def test_past_states_in_place_of_past_signals_claim_too_little():
-    """One y heard twice has one sensor noise: with x_{k-d} as states it would count as two."""
+    """One y received twice has one sensor noise: with x_{k-d} as states it would count as two."""
     moved = np.block([[A, np.zeros((2, 4))], [np.eye(4), np.zeros((4, 2))]])
     noise, spread = np.zeros((6, 6)), np.zeros((6, 6))
     noise[:2, :2], spread[:2, :2] = Q, SPREAD
@@ -135,21 +135,21 @@ def test_delays_that_are_a_chain():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_told_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
-    """Values heard twice, out of order, lost, and too late to be of any step."""
+    """Values received twice, out of order, lost, and too late to be of any step."""
     generator = np.random.default_rng(seed)
     delays = generator.choice(3, p=WEIGHTS, size=12)
-    parts, state = oracle.signals(A, Q, C, R, START, SPREAD, 12), filters["told"].init()
+    parts, state = oracle.signals(A, Q, C, R, START, SPREAD, 12), filters["informed"].init()
     received = oracle.of_known(parts, delays, 1.0, 1.0, N)
     for k, d in enumerate(delays):
-        state, estimate = filters["told"].step(state, [generator.normal(), float(d)], k=k)
+        state, estimate = filters["informed"].step(state, [generator.normal(), float(d)], k=k)
         best = oracle.best_linear(parts, received, k + 1)
         np.testing.assert_allclose(estimate.covariance, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
-    unknown = filters["told"].correct(state, [0.3, np.nan], k=12)[0]
+    unknown = filters["informed"].correct(state, [0.3, np.nan], k=12)[0]
     np.testing.assert_array_equal(unknown.mean, state.mean)
 
 
 def test_a_constant_delay_is_predicted_over(filters):
-    """Against the filter of all that was sent, which hears the same through gaps; with an input, and its innovation."""
+    """Against the filter of all that was sent, which has the same through gaps; with an input, and its innovation."""
     plant = hg.LinearPlant(A, Q, START, SPREAD, input_matrix=[[0.0], [1.0]])
     late = hg.linear_filter(plant, SENSOR, FIXED)
     larger = hg.filters.part_filter(hg.linear_filter(*hg.model.with_past(plant, SENSOR, FIXED)), 2)
@@ -178,8 +178,8 @@ def simulated(filters):
     """A network of all of them and of late relays, and its record."""
     relayed = hg.amplify_and_forward(RELAYS)
     nodes = {
-        "untold": hg.Node(SENSOR, UNKNOWN, {name: filters[name] for name in ("untold", "as_current")}),
-        "told": hg.Node(SENSOR, KNOWN, {"told": filters["told"]}),
+        "uninformed": hg.Node(SENSOR, UNKNOWN, {name: filters[name] for name in ("uninformed", "as_current")}),
+        "informed": hg.Node(SENSOR, KNOWN, {"informed": filters["informed"]}),
         "fixed": hg.Node(SENSOR, FIXED, {}),
         "relayed": hg.Node(SENSOR, relayed, {"exact": hg.linear_filter(PLANT, SENSOR, relayed)}),
     }
@@ -191,10 +191,10 @@ def simulated(filters):
 def test_simulated_errors_are_as_known_before(simulated):
     _, record = simulated
     errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, estimate in record.estimates.items() for f in estimate}
-    known = {("untold", "untold"): 0.649, ("untold", "as_current"): 0.896, ("told", "told"): 0.460}
+    known = {("uninformed", "uninformed"): 0.649, ("uninformed", "as_current"): 0.896, ("informed", "informed"): 0.460}
     for name, expected in known.items():
         assert abs(errors[name].mean() - expected) < 3 * errors[name].std() / 32
-    published = record.estimates["told"]["told"].covariance[:, -1, 0, 0]
+    published = record.estimates["informed"]["informed"].covariance[:, -1, 0, 0]
     assert abs(published.mean() - 0.460) < 3 * published.std() / 32
 
 
@@ -221,22 +221,22 @@ def test_relays_that_are_late_by_chance(simulated):
 
 @pytest.mark.slow
 def test_a_record_as_events(simulated):
-    """Each value under the step that it is of; a value that is heard twice comes under one number twice."""
+    """Each value under the step that it is of; a value that is received twice comes under one number twice."""
     network, record = simulated
-    known = hg.Record(record.time, record.states, None, {n: record.measurements[n] for n in ("told", "fixed")}, {})
+    known = hg.Record(record.time, record.states, None, {n: record.measurements[n] for n in ("informed", "fixed")}, {})
     events = hg.simulation.arrivals(known, network, run=3)
-    published, z = [event for event in events if event[0] == "told"], record.measurements["told"][3]
+    published, z = [event for event in events if event[0] == "informed"], record.measurements["informed"][3]
     assert [event[-1] for event in events] == sorted(event[-1] for event in events)
     assert [event[2] for event in published] == [k - d for k, d in enumerate(z[:, 1]) if k >= d]
     np.testing.assert_array_equal([event[3][0] for event in published], [v for k, (v, d) in enumerate(z) if k >= d])
     assert len({event[1] for event in published}) < len(published)
     assert [(event[1], event[-1]) for event in events if event[0] == "fixed"] == [(k, k + 2.0) for k in range(28)]
-    with pytest.raises(ValueError, match="delays of node 'untold'"):
+    with pytest.raises(ValueError, match="delays of node 'uninformed'"):
         hg.simulation.arrivals(record, network)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["told", "fixed"])
+@pytest.mark.parametrize("name", ["informed", "fixed"])
 def test_the_contract(filters, name):
     check_filter(filters[name])
 

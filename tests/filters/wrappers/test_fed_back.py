@@ -1,4 +1,4 @@
-"""A sensor that hears back sends the innovation: simulated as filtered, with exact claims."""
+"""A sensor with feedback sends the innovation: simulated as filtered, with exact claims."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -91,7 +91,7 @@ def test_with_known_gains_it_is_the_kalman_filters_likelihood():
 
 @pytest.fixture(scope="module")
 def rayleigh():
-    """4,000 steps of a Rayleigh link: what is foretold by its law, and by two points of the same mean and variance."""
+    """4,000 steps of a Rayleigh link: what is predicted by its law, and by two points of the same mean and variance."""
     law, node = hg.Rayleigh(0.8), {"open": hg.filters.open_loop_filter(PLANT)}
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.hop(law, 0.1), node)})
     z = hg.monte_carlo(network, horizon=4000, runs=1, key=0).measurements["a"][0]

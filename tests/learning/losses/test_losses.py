@@ -8,7 +8,7 @@ from scipy.stats import binomtest, chi2_contingency
 
 import heliograph as hg
 from heliograph.learning.losses.hidden_losses import Runs
-from heliograph.learning.losses.shares import wilson
+from heliograph.numerics.shares import wilson
 
 NAN = np.nan
 LOGITS = logit([0.1, 0.6, 0.05, 0.2])  # loss when good, when bad, fail, recover

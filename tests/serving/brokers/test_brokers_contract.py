@@ -1,4 +1,4 @@
-"""Both kinds of brokers keep the contract of transports, and have what they were told when they say so."""
+"""Both kinds of brokers keep the contract of transports, and have what was published when they say so."""
 
 import asyncio
 import contextlib
@@ -110,7 +110,7 @@ def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: st
         result = await observe(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
         assert result == [b"now", *[output.body for output in outputs]]
         if isinstance(transport, Nats):
-            await transport.publish(outputs)  # told again, as after a restart
+            await transport.publish(outputs)  # published again, as after a restart
             info = await transport._client.jetstream().stream_info("outnats-out")
             assert info.state.messages == len(outputs)
         await transport.close()

@@ -144,7 +144,7 @@ class Late(Memory):
         return super().transport()
 
 
-def test_another_order_of_what_comes_again_is_allowed_and_told():
+def test_another_order_of_what_comes_again_is_allowed_and_informed():
     assert not check_transport(Late(), patience=5.0)
 
 

@@ -1,4 +1,4 @@
-"""Pipes: lines however they are cut, readers that are slow, and a service that is told to stop."""
+"""Pipes: lines however they are cut, readers that are slow, and a service that is asked to stop."""
 
 import asyncio
 import os
@@ -101,7 +101,7 @@ class Counting:
 
 
 def serve(service, source, target, after):
-    """Keep a service running that is told to stop after this many seconds."""
+    """Keep a service running that is asked to stop after this many seconds."""
     timer = Timer(after, os.kill, (os.getpid(), signal.SIGTERM))
     timer.start()
     before = signal.getsignal(signal.SIGTERM)

@@ -17,7 +17,7 @@ class DiedError(Exception):
 
 
 class Dying(Store):
-    """A store that dies at a commit: before it, within it, or after it, before anybody hears of it."""
+    """A store that dies at a commit: before it, within it, or after it, before anybody learns of it."""
 
     countdown, where = -1, ""
 
@@ -38,7 +38,7 @@ class Dying(Store):
 
 
 def journal(store):
-    """What was told once, by plant and time or reason, without its number; a refusal may come again with a message."""
+    """What was published once, by plant and time or reason, without its number; a refusal may come again."""
     known = store.entries()
     assert [item.number for item in known] == list(range(1, len(known) + 1))
     return [{k: v for k, v in json.loads(item.body).items() if k != "id"} for item in known if item.kind == "final"]

@@ -48,7 +48,7 @@ def test_every_run_is_the_one_that_a_loop_makes():
 
 
 def world(plain):
-    """Two nodes that hear everything and one that loses half of it."""
+    """Two nodes that receive everything and one that loses half of it."""
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     nodes = {}
     for name, gain, channel in (("a", 1.0, plain), ("b", 0.3, plain), ("lost", 1.0, hg.erasure(plain, 0.5))):
@@ -81,7 +81,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
 def test_columns_of_what_relays_heard_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, own_error_design(net, 4))
-    receivers = {"own": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
+    receivers = {"local": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
     network = hg.Network.of_relays(net, schedules, receivers)
     z = np.linspace(0.1, 0.4, 4)
     columns = {"time": np.arange(4.0), "receiver.y0": z}

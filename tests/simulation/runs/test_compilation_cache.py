@@ -15,15 +15,15 @@ PROGRAM = """
 import sys, heliograph
 heliograph.simulation.keep_compilations(sys.argv[1])
 import jax, numpy as np
-heard = []
-jax.monitoring.register_event_listener(lambda name, **_: heard.append(name))
+received = []
+jax.monitoring.register_event_listener(lambda name, **_: received.append(name))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 plant = heliograph.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
 sensor, channel = heliograph.LinearSensor([[1.0]], 0.1), heliograph.hop(1.0, 0.1)
 item = heliograph.cubature_filter(plant, sensor, channel)
 network = heliograph.Network(plant, {"a": heliograph.Node(sensor, channel, {"f": item})})
 print(repr(float(heliograph.monte_carlo(network, 3, 2, 0).truth.sum())))
-print(heard.count("/jax/compilation_cache/cache_hits"), heard.count("/jax/compilation_cache/cache_misses"))
+print(received.count("/jax/compilation_cache/cache_hits"), received.count("/jax/compilation_cache/cache_misses"))
 """
 
 

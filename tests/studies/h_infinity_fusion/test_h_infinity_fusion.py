@@ -201,7 +201,7 @@ def result(nodes, outcome):
     """Everything, with made-up numbers where the real ones take minutes."""
     finding = hg.h_infinity.check_growth(dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
     size = finding._replace(ratio=0.69, differences=False)
-    filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told"]
+    filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_known"]
     errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
     over = {
         s: {n: np.linspace(1, 2 + i, structured.STEPS) for i, n in enumerate(filters)} for s in structured.SCENARIOS
@@ -213,7 +213,7 @@ def result(nodes, outcome):
         errors, errors, over, worst, 100,
     )  # fmt: skip
     shown = outcome.record.estimates["fused"]
-    known = {f"ekf_told.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
+    known = {f"ekf_known.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
     also = {f"horizon.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
     estimates = outcome.record.estimates | {"fused": shown | known | also}
     whole = replace(outcome, record=replace(outcome.record, estimates=estimates), filters=(*outcome.filters, "horizon"))
@@ -225,7 +225,7 @@ def result(nodes, outcome):
         1e-16,
         worst_disturbance.Worst(0.0272, 1e-6, None),
         whole,
-        example.Runs(SETTING, whole.record, ("ekf_told",)),
+        example.Runs(SETTING, whole.record, ("ekf_known",)),
         replayed,
         indices.indices(outcome, replayed),
         growth.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
@@ -259,7 +259,7 @@ def test_the_summary_has_every_key(folder):
     assert summary["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
     assert summary["saturation"]["dynamic_decodable"] == 0
     assert summary["saturated_fraction"] == summary["saturation"]["dynamic"]
-    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= summary["contexts"]["ekf_told"].keys()
+    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= summary["contexts"]["ekf_known"].keys()
     assert len(summary["index"]["J1"][RECURSIVE]) == 4
     assert {"growth", "discriminating", "claims", "saturated_fraction"} <= summary.keys()
 
@@ -275,7 +275,7 @@ def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(folder / "record.nc", engine="h5netcdf") as record:
         assert record["gain"].shape == (4, 16, 2, 2)
-        assert record["second_mean_fused_error"].sel(filter="ekf_told", scenario="white").shape == (structured.STEPS,)
+        assert record["second_mean_fused_error"].sel(filter="ekf_known", scenario="white").shape == (structured.STEPS,)
     assert "true but empty" in (folder / "report.html").read_text()
     fits(folder / "report.html")
 

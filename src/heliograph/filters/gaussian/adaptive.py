@@ -112,13 +112,13 @@ class AdaptiveFilter(AbstractSizedFilter):
     @in_float64
     def estimate(self, state: AdaptiveBelief) -> Estimate:
         """The filter's own."""
-        estimate_ = self.base.estimate(Belief(state.mean, state.covariance))
-        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+        posterior = self.base.estimate(Belief(state.mean, state.covariance))
+        return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
         """Noise variances of what arrives, b / a, of one state or of several stacked."""
-        result: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
-        return result
+        variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
+        return variances
 
 
 class Learned(NamedTuple):
@@ -164,8 +164,8 @@ def _learn(
     # The state with the last variances.
     if law is not None:
         branches = _scaled(law, last / variance)
-        result = score_update(before, z, *branches)
-        x, p = result.mean, result.covariance
+        corrected = score_update(before, z, *branches)
+        x, p = corrected.mean, corrected.covariance
     else:
         x, p = joint_update(before, e, received, used)
     after = AdaptiveBelief(

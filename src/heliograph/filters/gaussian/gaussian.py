@@ -74,7 +74,7 @@ class GaussianFilter(AbstractBeliefFilter):
         # F, Q and M H of the step.
         u = jnp.asarray(u)
         observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
-        result = linear_smoother_step(
+        step = linear_smoother_step(
             after,
             prior,
             plant.transition_matrix(u),
@@ -84,7 +84,7 @@ class GaussianFilter(AbstractBeliefFilter):
             innovation.covariance,
             self.claim,
         )
-        return replace(result, angles=plant.angles)
+        return replace(step, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
@@ -195,11 +195,11 @@ def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    transform: AbstractTransform,
-    update: AbstractUpdate | None = None,
+    transform: "AbstractTransform",
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
     Args:
@@ -228,10 +228,10 @@ def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Cubature Kalman filter on its channel's second moments.
 
     Args:
@@ -258,10 +258,10 @@ def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    update: AbstractUpdate | None = None,
+    update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+) -> "GaussianFilter":
     """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
     Args:

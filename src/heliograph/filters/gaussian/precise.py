@@ -31,8 +31,8 @@ LEFT = 100  # times its rounding: a variance below has lost its digits
 class Component(NamedTuple):
     """One component of T z, whose rows make the noises of the components uncorrelated.
 
-    Shapes: number e_j (m,), row T H of it and size |T| |H|, of which it is a difference (n,), the noise's variance (),
-    least variance that is not rounding (); or of all components, one more axis first. Runs last.
+    Shapes: number e_j (m,), row T H of it and its rounding in eps, size (n,), the noise's variance (), least variance
+    that is not rounding (); or of all components, one more axis first. Runs last.
     """
 
     number: jax.Array
@@ -74,12 +74,20 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
-    """T (m, m) and the components of T z, with the rounding that the elimination leaves in each row."""
+    """T (m, m) and the components of T z, with the rounding that the elimination leaves in each row.
+
+    T H is off by eps |T| (|H| + W |T H|), W_ji = root(N_jj N_ii) / D_i for i < j: what an error of eps in the products
+    of N = L D L' changes in L_ji. Noises that are tied leave small D_i, as does the power of a random gain and a mean
+    far from zero.
+    """
     m, n = output.shape[:2]
     ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
     turned, variance = uncorrelated(noise, jnp.concatenate([ones, output], axis=1))
     turn, rows = turned[:, :m], turned[:, m:]
-    size = times(jnp.abs(turn), jnp.abs(output))
+    deviation, safe = jnp.sqrt(jnp.maximum(diagonal_of(noise), 0.0)), jnp.where(variance > 0, variance, jnp.inf)
+    earlier = np.tri(m, k=-1).reshape(m, m, *[1] * (noise.ndim - 2))
+    of_factor = earlier * deviation[:, None] * (deviation / safe)[None]
+    size = times(jnp.abs(turn), jnp.abs(output) + times(of_factor, jnp.abs(rows)))
     reach = times(size, jnp.abs(start))
     least = ((n + 2) * float(np.finfo(start.dtype).eps) * LEFT) ** 2 * summed(reach * reach, 1)
     return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, least)

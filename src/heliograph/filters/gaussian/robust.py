@@ -139,11 +139,11 @@ def robust_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    rule: AbstractWeights | None = None,
-    transform: AbstractTransform | None = None,
+    rule: "AbstractWeights | None" = None,
+    transform: "AbstractTransform | None" = None,
     initial_mean: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
-) -> RobustFilter:
+) -> "RobustFilter":
     """Filter whose estimate no single outlier can take far, for noise laws such as `StudentT` and `Contaminated`.
 
     Without a rule, the score update: the exact posterior mean and covariance of each component, for a Gaussian prior

@@ -12,8 +12,8 @@ from heliograph.numerics.types import Array, Float
 def initial_size(mean: Array, covariance: Array) -> Float[jax.Array, " n"]:
     """E[x_i^2] before the first step, (n,)."""
     mean = jnp.asarray(mean)
-    result: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(covariance))
-    return result
+    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(covariance))
+    return seconds
 
 
 @runs_last

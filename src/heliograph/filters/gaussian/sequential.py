@@ -63,16 +63,16 @@ class SequentialFilter(AbstractSizedFilter):
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
         """Mean and covariance of the belief, by the first node's filter."""
-        estimate_ = self.filters[0].estimate(state)
-        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+        posterior = self.filters[0].estimate(state)
+        return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
         """Return the moments around all nodes' updates."""
-        item = self.filters[0]
-        cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, self.claim, first(item.plant).angles)
+        head = self.filters[0]
+        cross = predicted(at(head.plant, k), head.transform, before, jnp.asarray(u)).cross
+        return moments_smoother_step(after, prior, cross, self.claim, first(head.plant).angles)
 
 
 def _joined(parts: Sequence[Innovation]) -> Innovation:

@@ -88,8 +88,8 @@ class LinearFilter(AbstractSizedFilter):
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         transition, shift, noise = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-        error, local = (moved(*part, transition, shift, noise) for part in (state[:2], state[2:]))
-        return LinearBelief(*error, *within_range(*local))
+        error, state_moments = (moved(*part, transition, shift, noise) for part in (state[:2], state[2:]))
+        return LinearBelief(*error, *within_range(*state_moments))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
@@ -288,9 +288,9 @@ def memoryless_filter(
 
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
-    item = linear_filter(plant, sensor, without_memory(channel), update)
-    assert isinstance(item, LinearFilter)  # a channel without memory has no other
-    return replace(item, claim="nominal") if memory_matters(channel) else item
+    ignoring = linear_filter(plant, sensor, without_memory(channel), update)
+    assert isinstance(ignoring, LinearFilter)  # a channel without memory has no other
+    return replace(ignoring, claim="nominal") if memory_matters(channel) else ignoring
 
 
 def as_current_filter(
@@ -311,6 +311,6 @@ def as_current_filter(
 
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
-    item = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
-    assert isinstance(item, LinearFilter)  # a channel without delay or memory has no other
-    return replace(item, claim="nominal") if first(channel).past else item
+    ignoring = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
+    assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
+    return replace(ignoring, claim="nominal") if first(channel).past else ignoring

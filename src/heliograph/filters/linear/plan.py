@@ -92,17 +92,17 @@ class PlannedFilter(AbstractSizedFilter):
         before: PlannedMean,
         prior: PlannedMean,
         after: PlannedMean,
-        innovation_: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
     ) -> AbstractSmootherStep:
         """Return the planned smoother step with the mean and the innovation of these data."""
         if self.past is None:
-            return super().smoother_step(before, prior, after, innovation_, z, u, k)
+            return super().smoother_step(before, prior, after, innovation, z, u, k)
         p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
-        innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
-        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
+        residual = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
+        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), residual)
 
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """Return the filter with smoother steps, which are the same for all data."""
@@ -123,7 +123,7 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
 
 
 def plan(
-    item: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
+    filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
 ) -> PlannedFilter:
     """Run a filter over complete data and record its matrices; its state has a `mean` and a `covariance`.
 
@@ -133,7 +133,7 @@ def plan(
     Raises:
         ValueError: inputs of another number than the filter's.
     """
-    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), projection)
+    return _plan(filter, array("inputs", inputs, (None, len(filter.inputs))), projection)
 
 
 @compiled

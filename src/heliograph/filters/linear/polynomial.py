@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -79,23 +80,17 @@ class PolynomialFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> PyTree:
         """Return the inner filter's state, and the mean that is subtracted before it."""
-        start = np.zeros(len(self.states)) if self.centre is None else self.centre.start
-        return Centred(self.inner.init(), jnp.asarray(start))
+        return Centred(self.inner.init(), _start(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: Centred, u: ArrayLike = (), k: Step = 0) -> Centred:
         """Predict with the inner filter, and move the mean."""
-        inner = self.inner.predict(state.inner, u, k)
-        if self.centre is None:
-            return Centred(inner, state.mean)
-        c = at(self.centre, k)
-        return Centred(inner, c.transition @ state.mean + c.drift)
+        return Centred(self.inner.predict(state.inner, u, k), _mean_moved(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
         """Lift z and correct the inner filter."""
-        z = jnp.asarray(z)
-        z = z if self.centre is None else z - at(self.centre, k).received @ state.mean
+        z = _without_mean(self.centre, z, state.mean, k)
         after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
         return Centred(after, state.mean), _of_degree_one(innovation, z, self.degree)
 
@@ -119,8 +114,7 @@ class PolynomialFilter(AbstractSizedFilter):
         k: Step,
     ) -> AbstractSmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
-        z = jnp.asarray(z)
-        z = z if self.centre is None else z - at(self.centre, k).received @ prior.mean
+        z = _without_mean(self.centre, z, prior.mean, k)
         inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
         return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
 
@@ -131,6 +125,24 @@ class PolynomialFilter(AbstractSizedFilter):
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """Return the filter with the smoother steps of its inner filter."""
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
+
+
+def _start(centre: Centre | None, n: int) -> jax.Array:
+    return jnp.zeros(n) if centre is None else jnp.asarray(centre.start)
+
+
+def _mean_moved(centre: Centre | None, mean: Array, k: Step) -> Array:
+    """E[x+] = A E[x] + b."""
+    if centre is None:
+        return mean
+    c = at(centre, k)
+    moved: jax.Array = c.transition @ mean + c.drift
+    return moved
+
+
+def _without_mean(centre: Centre | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
+    """z - G C E[x]."""
+    return jnp.asarray(z) if centre is None else jnp.asarray(z) - at(centre, k).received @ mean
 
 
 def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
@@ -219,53 +231,56 @@ def scheduled_polynomial_filter(
 
 
 class MemoryState(NamedTuple):
-    """States of the linear filter and of the filter of products."""
+    """States of the linear filter and of the filter of products, and the mean (n,) of x that is subtracted before."""
 
     linear: ScheduleState
     products: ScheduleState
+    mean: Float[Array, " n"]
 
 
 class MemoryFilter(AbstractSizedFilter):
     """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
 
     With saved gains, for complete data; see `ScheduledFilter` for the effect of gaps, `PolynomialFilter` for the
-    innovation.
+    innovation and for `centre`.
     """
 
     linear: ScheduledFilter
     products: ScheduledFilter
+    centre: Centre | None
 
-    def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim):
-        self.linear, self.products, self.claim = linear, products, claim
+    def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: Centre | None = None):
+        self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
 
     @in_float64
     def init(self) -> MemoryState:
-        """Return the initial states of both filters."""
-        return MemoryState(self.linear.init(), self.products.init())
+        """Return the initial states of both filters, and the mean that is subtracted before them."""
+        return MemoryState(self.linear.init(), self.products.init(), _start(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
-        """Predict with both filters."""
-        return MemoryState(self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k))
+        """Predict with both filters, and move the mean."""
+        linear, products = self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k)
+        return MemoryState(linear, products, _mean_moved(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
         """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
-        z = jnp.asarray(z)
+        z = _without_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
         lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
         products, innovation = self.products.correct(state.products, lifted, k)
-        return MemoryState(linear, products), _of_degree_one(innovation, z, 2)
+        return MemoryState(linear, products, state.mean), _of_degree_one(innovation, z, 2)
 
     @in_float64
     def estimate(self, state: MemoryState) -> Estimate:
-        """Estimate of the filter of products."""
-        return self.products.estimate(state.products)
+        """Estimate of the filter of products, plus the mean."""
+        return _moved(self.products.estimate(state.products), state.mean)
 
     def after_step(self, state: MemoryState, k: Step) -> Estimate:
-        """Estimate of the filter of products after step k."""
-        return self.products.after_step(state.products, k)
+        """Estimate of the filter of products after step k, plus the mean."""
+        return _moved(self.products.after_step(state.products, k), state.mean)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
@@ -287,10 +302,12 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
     claim = claim_of(channel)
     # The linear filter's gains are needed for the moments of its products with z.
-    linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
-    products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)
+    centre, system = _lifted(plant, sensor, channel, 1, horizon)
+    linear = lmmse(system, claim)
+    about = plant if centre is None else without_mean(plant)
+    products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)
     names = first(plant).states
-    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim)
+    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
 
 
 def claim_of(channel: Channel) -> Claim:

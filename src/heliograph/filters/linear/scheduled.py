@@ -190,11 +190,11 @@ class LinearSystemFilter(AbstractSizedFilter):
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
     def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation_: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractSmootherStep:
         """Return the linear update."""
         s: Steps = at(self.steps, k)
-        innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
+        residual = jnp.asarray(z) - s.output @ prior.mean - s.offset
         total = s.output @ prior.covariance @ s.output.T + s.noise
         return linear_smoother_step(
             after,
@@ -202,7 +202,7 @@ class LinearSystemFilter(AbstractSizedFilter):
             s.transition,
             s.process,
             s.output,
-            innovation,
+            residual,
             total,
             self.claim,
             self.projection,

@@ -123,7 +123,7 @@ def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: Observa
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
-    result = []
+    errors = []
     # Given the mode: the mean map of r, then what the gain's spread and the noise add.
     for moment, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
         law = moment[n, n]
@@ -135,5 +135,5 @@ def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: Observa
         added = np.einsum("mlab,ab->ml", spread, second) + law * mean @ noise @ mean.T
         after = use @ moment @ use.T
         after[n + 1 :, n + 1 :] += gain @ added @ gain.T
-        result.append(after)
-    return np.array(result)
+        errors.append(after)
+    return np.array(errors)

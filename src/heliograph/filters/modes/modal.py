@@ -108,14 +108,8 @@ class ModalFilter(AbstractModalFilter):
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
         step, move, noise, centre, rows = self._moves(state, u, k)
-        modes, size = len(state.moments), len(move)
-        # E[x~ x~' 1{mode}] one step later.
-        carried = move @ state.moments @ move.T
-        added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
-        moments = jnp.einsum("ij,iab->jab", rows, carried) + added
-        chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
-        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
-        # F P F' + the covariance above.
+        # E[x~ x~' 1{mode}] one step later, and F P F' + the covariance above.
+        moments, fresh = _spread_of_moves(state.moments, move, noise, rows)
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
         # F zeta about the moving centre.
         law = state.moments[:, -1, -1]
@@ -162,17 +156,30 @@ class ModalFilter(AbstractModalFilter):
     ) -> AbstractSmootherStep:
         """Return the linear update of zeta."""
         output, _, _ = self._observe(prior, k)
+        step, move, noise, _, rows = self._moves(before, u, k)
         return linear_smoother_step(
             after,
             prior,
-            self._moves(before, u, k)[0],
-            None,
+            step,
+            _spread_of_moves(before.moments, move, noise, rows)[1],
             output,
             innovation.value,
             innovation.covariance,
             self.claim,
             self._projection(),
         )
+
+
+def _spread_of_moves(
+    moments: jax.Array, move: jax.Array, noise: jax.Array, rows: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """E[x~ x~' 1{mode}] one step later (M, n + 1, n + 1), and Cov(zeta+ - F zeta) (N, N)."""
+    modes, size = len(moments), len(move)
+    carried = move @ moments @ move.T
+    added = (moments[:, -1, -1] @ rows)[:, None, None] * noise
+    chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
+    fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
+    return jnp.einsum("ij,iab->jab", rows, carried) + added, fresh
 
 
 def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:

@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import congruence, symmetric, times_vector, with_rounding
-from heliograph.numerics.types import Float, PyTree
+from heliograph.numerics.types import Bool, Float, PyTree
 
 
 class Moments(NamedTuple):
@@ -25,11 +26,17 @@ class Moments(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Mean and covariance of an earlier state x_j given the data so far; `link` maps new information back to it."""
+    """Mean and covariance of an earlier state x_j given the data so far, and how it goes with the state y now.
+
+    By x_j = link y + d, apart = Cov d, and by cross = Cov(x_j, y). precise: whether some update since j was.
+    """
 
     mean: Float[jax.Array, " N"]
     covariance: Float[jax.Array, "N N"]
     link: Float[jax.Array, "N N"]
+    apart: Float[jax.Array, "N N"]
+    cross: Float[jax.Array, "N N"]
+    precise: Bool[jax.Array, ""]
 
 
 class AbstractSmootherStep(Module):
@@ -66,8 +73,8 @@ class AbstractSmootherStep(Module):
         """Return the filter's state after this step, given later data."""
         raise NotImplementedError
 
-    def ahead(self, point: Point) -> Point:
-        """Return an earlier state given this step's data too."""
+    def ahead(self, point: Point, covariance: jax.Array) -> Point:
+        """Return an earlier state given this step's data too; the filter had this covariance before the step."""
         raise NotImplementedError
 
     def before(self, item: "AbstractSmootherStep", earlier: PyTree, known: Moments) -> Moments:
@@ -79,8 +86,9 @@ class AbstractSmootherStep(Module):
 
     def start(self) -> Point:
         """Return the state after this step as a point to be carried ahead."""
-        n = self.mean.shape[-1]
-        return Point(self.mean, self.covariance, self._link(n))
+        unit = jnp.broadcast_to(jnp.eye(self.mean.shape[-1]), self.covariance.shape)
+        nothing = jnp.zeros_like(self.covariance)
+        return Point(self.mean, self.covariance, unit, nothing, self.covariance, jnp.asarray(False))
 
     def without_data(self) -> "AbstractSmootherStep":
         """Return the same step without the parts that only means depend on."""
@@ -88,9 +96,6 @@ class AbstractSmootherStep(Module):
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractSmootherStep":
         """Return the same step with other data of the same arrivals: other means and innovation."""
-        raise NotImplementedError
-
-    def _link(self, n: int) -> jax.Array:
         raise NotImplementedError
 
     def estimate_from(self, result: Moments | Point) -> Estimate:

@@ -13,7 +13,17 @@ from heliograph.filters.smoother_step.linear import LinearSmootherStep
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
+from heliograph.numerics.small_matrix import (
+    PRECISE,
+    congruence,
+    diagonal,
+    diagonal_of,
+    pivots,
+    rounding,
+    solve,
+    times,
+    transpose,
+)
 from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Array, Float
 
@@ -44,11 +54,12 @@ class MomentsSmootherStep(AbstractSmootherStep):
         """Return the moments as they are."""
         return later
 
-    def ahead(self, point: Point) -> Point:
+    def ahead(self, point: Point, covariance: jax.Array) -> Point:
         """x_j + M (y - y-) and P_j - M (P- - P) M', M the product of all J since j."""
         gain = _product_of(point.link, self._gain())
         news = applied(gain, self.mean - self.prior_mean)
-        return Point(point.mean + news, less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+        after = less(point.covariance, gain, self.prior_covariance - self.covariance)
+        return point._replace(mean=point.mean + news, covariance=after, link=gain)
 
     def without_data(self) -> AbstractSmootherStep:
         """Return the step without both means."""
@@ -58,9 +69,6 @@ class MomentsSmootherStep(AbstractSmootherStep):
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
         """Return the step with these means."""
         return replace(self, mean=mean, prior_mean=prior_mean)
-
-    def _link(self, n: int) -> jax.Array:
-        return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
 
     def _gain(self) -> jax.Array:
         return _solved(self.prior_covariance, self.cross)
@@ -118,7 +126,7 @@ def linear_smoother_step(
     after: HasMoments,
     prior: HasMoments,
     transition: Array,
-    process: Array | None,
+    process: Array,
     output: Array,
     innovation: Array,
     total: Array,
@@ -126,25 +134,28 @@ def linear_smoother_step(
     projection: Array | None = None,
     solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> LinearSmootherStep:
-    """Build the step from the states after and before a correction, A, Q (None: not separately known), H, e, and S.
+    """Build the step from the states after and before a correction, A, Q, H, e, and S.
 
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
     component that others determine is left out.
     """
-    # H' S^-1 and K = P- H' S^-1 of the components that arrived.
-    given = jnp.asarray(prior.covariance), jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    spread = jnp.asarray(prior.covariance)
+    given = spread, jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
     # H' S^-1 and K = P- H' S^-1 of the components that arrived.
     if solve is None:
-        gain, weigh, received, innovation = _parts(*given)
+        gain, weigh, received, arrived, innovation = _parts(*given)
     else:
-        received, total, innovation = _of_what_arrived(*given[1:])
-        weigh = solve(total, received).T
-        gain = given[0] @ weigh
+        received, arrived, innovation = _of_what_arrived(*given[1:])
+        weigh = solve(arrived, received).T
+        gain = spread @ weigh
     return LinearSmootherStep(
         mean=jnp.asarray(after.mean),
         covariance=jnp.asarray(after.covariance),
+        prior_mean=jnp.asarray(prior.mean),
+        prior_covariance=spread,
+        precise=_precise(spread, received, arrived),
         transition=jnp.asarray(transition),
-        process=None if process is None else jnp.asarray(process),
+        process=jnp.asarray(process),
         gain=gain,
         output=received,
         weigh=weigh,
@@ -162,7 +173,14 @@ def linear_smoother_step(
 def _parts(prior: jax.Array, output: jax.Array, total: jax.Array, innovation: jax.Array) -> tuple[jax.Array, ...]:
     received, total, innovation = _of_what_arrived(output, total, innovation)
     weigh = transpose(small_solve(total, received))
-    return times(prior, weigh), weigh, received, innovation
+    return times(prior, weigh), weigh, received, total, innovation
+
+
+@runs_last
+def _precise(prior: jax.Array, output: jax.Array, total: jax.Array) -> jax.Array:
+    """Test whether the noise S - H P- H' of some component, given those before it, is far below S (or is rounding)."""
+    noise = pivots(total - congruence(output, prior))
+    return jnp.any(~(noise >= rounding(PRECISE, total, 1000) * diagonal_of(total)), axis=0)
 
 
 def _of_what_arrived(

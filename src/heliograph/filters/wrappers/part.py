@@ -38,9 +38,9 @@ class AbstractPartFilter(AbstractSizedFilter):
         """Mean and covariance of the first states."""
         return self._part(self.base.estimate(state))
 
-    def _part(self, estimate_: Estimate) -> Estimate:
+    def _part(self, whole: Estimate) -> Estimate:
         n = len(self.states)
-        return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
+        return Estimate(whole.mean[..., :n], whole.covariance[..., :n, :n], self.claim)
 
 
 class PartFilter(AbstractPartFilter):

@@ -42,7 +42,7 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
         ValueError: relays that filter and forward, several nodes of which one varies over time.
     """
     if network.relays is not None:
-        raise fail("network to be learned", "nodes that hear sensors through channels", "relays that filter")
+        raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
     if network.common is not None:
         return network.plant, network.common.sensor, _joint_channel(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]

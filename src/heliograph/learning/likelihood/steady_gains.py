@@ -69,8 +69,8 @@ def innovations(
     """
     gains, gain_slopes, converged = _gains(item, slopes, z.shape[1], random)
 
-    def observe(filter_: LinearFilter, gains: Gains) -> Innovations:
-        return Innovations(in_chunks(gains.plan, gains.gain, filter_.init().mean, z), gains.covariance)
+    def observe(filter: LinearFilter, gains: Gains) -> Innovations:
+        return Innovations(in_chunks(gains.plan, gains.gain, filter.init().mean, z), gains.covariance)
 
     return *_along(observe, (item, gains), (slopes, gain_slopes)), converged
 
@@ -84,8 +84,8 @@ def _gains(item: LinearFilter, slopes: PyTree, steps: int, random: bool) -> tupl
     """Gains step by step until the moments converge, constant from there on; and whether they did in time."""
     quiet, limit = jnp.zeros(item.received), min(steps, max(int(PART * steps), FEWEST))
 
-    def one_step(filter_: LinearFilter, state: LinearBelief) -> tuple[LinearBelief, Plan, list[jax.Array]]:
-        plan, prior, after = followed(filter_, state, quiet, jnp.zeros(0), 0)
+    def one_step(filter: LinearFilter, state: LinearBelief) -> tuple[LinearBelief, Plan, list[jax.Array]]:
+        plan, prior, after = followed(filter, state, quiet, jnp.zeros(0), 0)
         return after, plan, _moments(prior, random)
 
     def further(state: PyTree) -> tuple[PyTree, ...]:

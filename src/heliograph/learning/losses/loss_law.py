@@ -4,13 +4,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from heliograph.learning.losses.shares import Share, wilson
 from heliograph.learning.losses.stretches import as_fates
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
+from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import MarkovChain

@@ -2,49 +2,18 @@
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, logit
-from scipy.stats import norm
 
-from heliograph.numerics.readable import readable
+from heliograph.numerics.shares import Share as Share
 
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
 FALL_AT_END = 1.352772  # where the maximum lies at 0 or 1 only one side is left: half its 90 % point
 END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 
 Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
-
-
-@readable
-class Share(NamedTuple):
-    """Probability with its 95 % interval.
-
-    Args:
-        estimate: the estimate.
-        low: lower end of the interval.
-        high: upper end.
-    """
-
-    estimate: float
-    low: float
-    high: float
-
-
-def wilson(hits: float, of: float) -> Share:
-    """Share k / n with Wilson's interval, |k - n p| <= 1.96 sqrt(n p (1 - p)) for its ends p; (NaN, 0, 1) of nothing.
-
-    Source: Wilson, Probable inference (1927).
-    """
-    if not of:
-        return Share(float("nan"), 0.0, 1.0)
-    z = float(norm.ppf(0.975))
-    p = hits / of
-    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
-    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
-    return Share(p, 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half))
 
 
 def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:

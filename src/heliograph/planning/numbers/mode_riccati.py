@@ -91,7 +91,7 @@ def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
         added = close @ m.process[:, None] @ close.swapaxes(2, 3) + gains @ m.noise @ gains.swapaxes(2, 3)
         source = m.law[:, :, None, None] * added
         operators = [_operator(chain, loop) for chain, loop in zip(m.chain, loops, strict=True)]
-        constant = reduce(lambda sum_, item: item[0] @ sum_ + item[1].ravel(),
+        constant = reduce(lambda total, item: item[0] @ total + item[1].ravel(),
                           zip(operators, source, strict=True), np.zeros(modes * n * n))  # fmt: skip
         product = reduce(lambda product, operator: operator @ product, operators)
         x, through = np.linalg.solve(np.eye(modes * n * n) - product, constant), []

@@ -184,7 +184,7 @@ def received(
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
     """Decide whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
-    return all(has_known_mean(second_order(map_)) for map_ in _observed_modes(name, channel).maps)
+    return all(has_known_mean(second_order(mode_map)) for mode_map in _observed_modes(name, channel).maps)
 
 
 def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
@@ -227,7 +227,7 @@ def _span(
     """H, N and powers over steps with one sensor and one channel."""
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
-    described = [_mode(map_, arrived, y, sensor, young) for map_, arrived in pairs]
+    described = [_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
 
     def powers(now: Array, law: Array) -> Array:

@@ -10,6 +10,7 @@ nothing is divided by a power, which may be zero.
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
@@ -21,6 +22,9 @@ from heliograph.planning.paths.information_filter import Plants, adjoint, covari
 
 Powers = Float[np.ndarray, "time hop"]
 PathValues = Float[np.ndarray, "time path"]
+Matrix = TypeAliasType("Matrix", Float[ArrayLike, "_ _"])
+Vector = TypeAliasType("Vector", Float[ArrayLike, " _"])
+ByHop = TypeAliasType("ByHop", Float[ArrayLike, "..."])  # (M, H); (M,) of one hop a path; one number for all
 
 
 @readable
@@ -49,17 +53,17 @@ class PathInformation(NamedTuple):
 
 
 def independent_paths(
-    transition: "Float[ArrayLike, 'n n']",
-    process: "Float[ArrayLike, 'n n']",
-    rows: "Float[ArrayLike, 'M n']",
-    noises: "Float[ArrayLike, ' M']",
-    kappa: "Float[ArrayLike, '...']",
-    alpha: "Float[ArrayLike, '...']",
-    error: Error | None = None,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
-    names_: tuple[str, ...] | None = None,
-) -> Paths:
+    transition: Matrix,
+    process: Matrix,
+    rows: Matrix,
+    noises: Vector,
+    kappa: ByHop,
+    alpha: ByHop,
+    error: "Error | None" = None,
+    initial_mean: Vector | None = None,
+    initial_covariance: Matrix | None = None,
+    transmitters: tuple[str, ...] | None = None,
+) -> "Paths":
     """Paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.
 
     A hop delivers g sent + m; relays amplify what they receive, noise included. Hops are listed path by path.
@@ -74,7 +78,7 @@ def independent_paths(
         error: over which steps: steady unless it has a period or a horizon.
         initial_mean: mean of x_0, shape (n,), zero unless given; used over a horizon.
         initial_covariance: covariance of x_0, shape (n, n), needed over a horizon.
-        names_: names of the transmitters, "sender0" and so on unless given.
+        transmitters: names of the transmitters, "sender0" and so on unless given.
 
     Returns:
         The paths, which `hg.design` takes in place of a network.
@@ -109,7 +113,7 @@ def independent_paths(
         path=np.repeat(np.arange(len(c)), hops),
         kappa=np.tile(fading.ravel(), (steps, 1)),
         alpha=np.tile(costs.ravel(), (steps, 1)),
-        names=names("names of transmitters", names_, len(c) * hops, "sender"),
+        names=names("names of transmitters", transmitters, len(c) * hops, "sender"),
     )
 
 

@@ -36,8 +36,8 @@ class DisturbedGain(NamedTuple):
     @property
     def covariance(self) -> np.ndarray:
         """Cov(H_ab, H_ij), shape (m, c, m, c)."""
-        result: np.ndarray = self.second - np.multiply.outer(self.mean, self.mean)
-        return result
+        covariance: np.ndarray = self.second - np.multiply.outer(self.mean, self.mean)
+        return covariance
 
     def spreads(self) -> np.ndarray:
         """Matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
@@ -51,8 +51,8 @@ class DisturbedGain(NamedTuple):
         values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c))
         largest = max(float(np.max(np.abs(self.second), initial=0.0)), float(np.max(values, initial=0.0)))
         used = values > ROUNDING * largest
-        result: np.ndarray = (np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
-        return result
+        factors: np.ndarray = (np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
+        return factors
 
 
 @singledispatch
@@ -119,10 +119,10 @@ def _known(matrix: np.ndarray) -> DisturbedGain:
 
 def _place(part: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
     """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
-    local = [p.mean.shape[1] - shared for p in parts]
-    start = shared + sum(local[:index])
-    columns = [*range(shared), *range(start, start + local[index])]
-    m, total = part.mean.shape[0], shared + sum(local)
+    private_widths = [p.mean.shape[1] - shared for p in parts]
+    start = shared + sum(private_widths[:index])
+    columns = [*range(shared), *range(start, start + private_widths[index])]
+    m, total = part.mean.shape[0], shared + sum(private_widths)
     mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
     mean[:, columns] = part.mean
     second[np.ix_(range(m), columns, range(m), columns)] = part.second

@@ -84,7 +84,7 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
     rows = []
     for powers in exponents(channel.outputs + 1, order):
         # Row z^a = prod_parts z_part^(a_part) times a power of the constant 1.
-        result: Interval = (np.ones(1), np.ones(1))
+        product: Interval = (np.ones(1), np.ones(1))
         degree, start = 0, 0
         for m, table in zip(channel.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
@@ -92,14 +92,14 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
             part = table[k]
             if part is not None:
                 row = position(m.outputs + 1, k)[(*a, 0)]
-                result, degree = (
-                    _multiply_rows(result, degree, (part[0][row], part[1][row]), k, variables),
+                product, degree = (
+                    _multiply_rows(product, degree, (part[0][row], part[1][row]), k, variables),
                     degree + k,
                 )
         # The constant's power is a column of its own.
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0
-        rows.append(_multiply_rows(result, degree, (constant, constant), powers[-1], variables))
+        rows.append(_multiply_rows(product, degree, (constant, constant), powers[-1], variables))
     return stacked([r[0] for r in rows]), stacked([r[1] for r in rows])
 
 

@@ -146,5 +146,5 @@ def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.nda
             rest = tuple(x - y for x, y in zip(a, b, strict=True))
             weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
             terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
-    row_, column, noise, weight_ = np.array(terms, dtype=np.int64).T
-    return row_, column, noise, weight_
+    rows, columns, noises, weights = np.array(terms, dtype=np.int64).T
+    return rows, columns, noises, weights

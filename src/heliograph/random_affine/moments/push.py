@@ -75,15 +75,15 @@ def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """
-    result: Array1
+    propagated: Array1
     if order % 2:
-        result = symmetric_power(homogeneous, order) @ moments
-        return result
+        propagated = symmetric_power(homogeneous, order) @ moments
+        return propagated
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     second = lifted @ second_moments(moments, inputs, order // 2) @ lifted.T
-    result = second.reshape(-1)[_one_place(outputs, order // 2)]
-    return result
+    propagated = second.reshape(-1)[_one_place(outputs, order // 2)]
+    return propagated
 
 
 class Tabulated(AbstractNoise):

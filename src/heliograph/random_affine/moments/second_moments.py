@@ -133,8 +133,8 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
-    local = parts[0] if known else nominal_spread(channel)
-    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], local, not known)
+    center = parts[0] if known else nominal_spread(channel)
+    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], center, not known)
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
@@ -183,8 +183,8 @@ def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
 def _of_signal(tensor: Tensor) -> Tensor:
     """The tensor without its last row and column, those of the constant 1."""
     signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
-    result: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
-    return result
+    signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
+    return signal_part
 
 
 def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:

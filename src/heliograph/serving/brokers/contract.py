@@ -134,8 +134,8 @@ class _Check:
         try:
             await asyncio.wait_for(listen(), self.patience)
         except TimeoutError:
-            missing, count_ = len(set(bodies) - set(result)), len(bodies)
-            what = f"receive: expected {count_} messages within {self.patience:g} s, {missing} did not come"
+            missing, total = len(set(bodies) - set(result)), len(bodies)
+            what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
             raise AssertionError(what) from None
         return _once(result)
 
@@ -156,7 +156,9 @@ class _Check:
         assert batch.payloads, "receive: expected to wait for messages, got a batch of none"
         if acknowledge:
             await self._soon("acknowledge", batch.acknowledge())
-        return list(batch.payloads)
+        bodies = [body for body in batch.payloads if isinstance(body, bytes)]
+        assert len(bodies) == len(batch.payloads), "receive: expected the bytes that were sent"
+        return bodies
 
     async def _soon(self, what: str, waiting: Awaitable[T]) -> T:
         try:
@@ -164,10 +166,10 @@ class _Check:
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
-    def _bodies(self, count_: int) -> list[bytes]:
+    def _bodies(self, total: int) -> list[bytes]:
         """Make bodies that were not sent before; the first is long."""
         return [
-            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(count_)
+            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)
         ]
 
 

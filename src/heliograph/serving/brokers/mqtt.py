@@ -4,13 +4,16 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv311
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
+from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, LONGEST, WHOLE, Batch, Part, word
 from heliograph.serving.brokers.url import Address
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 MOST = 1000  # messages of a batch
@@ -21,15 +24,17 @@ AT_LEAST_ONCE = 1
 class Mqtt:
     """Transport over MQTT: messages under TOPIC/in, or TOPIC/in/PART if shared; outputs to TOPIC/out/KIND/PLANT.
 
+    The topics of the sources are read too.
+
     The session belongs to the part, not to the process: whoever reads a part next takes over its session, and with it
     the messages that were not acknowledged. The broker closes the connection of the previous reader. We speak version
     3.1.1, which every broker supports. Reading and writing have a connection each, since reading may have to wait while
     something is written.
     """
 
-    def __init__(self, address: Address, part: Part = WHOLE):
+    def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
         self.address = address
-        self._reader, self._writer = _Reader(address, part), _Writer(address)
+        self._reader, self._writer = _Reader(address, part, translator), _Writer(address)
 
     async def receive(self) -> Batch | None:
         return await self._reader.receive()
@@ -92,37 +97,51 @@ class _Connection:
 class _Reader(_Connection):
     """Connection that receives messages and holds them until `receive` takes them."""
 
-    def __init__(self, address: Address, part: Part):
+    def __init__(self, address: Address, part: Part, translator: Translator | None):
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
         self._below = f"{part.number}/#" if part.of > 1 else "#"
         self._loop, self._came = asyncio.get_running_loop(), asyncio.Event()
-        self._held: deque[tuple[int, MQTTMessage]] = deque()
+        self._prefix, self._translator = f"{address.topic}/in/", translator
+        self._held: deque[tuple[int, MQTTMessage, datetime]] = deque()
         self._connection = 0
         self.client.on_message = self._on_message
         self.start()
 
     async def receive(self) -> Batch:
-        batch = list[tuple[int, MQTTMessage]]()
-        while not batch:  # the word that one came may come after the batch that took it
+        batch, payloads = list[tuple[int, MQTTMessage, datetime]](), list[Payload]()
+        # Wait until messages came of which there is something to give.
+        while not payloads:  # the word that one came may come after the batch that took it
+            for connection, message, _ in batch:  # of topics that nobody reads
+                self._acknowledge(connection, message)
             await self._came.wait()
             with self.room:
                 batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
                 if not self._held:
                     self._came.clear()
                 self.room.notify_all()
+            payloads = [payload for _, message, arrival in batch for payload in self._payloads(message, arrival)]
 
         async def acknowledge() -> None:
-            for connection, message in batch:
-                if connection == self._connection:  # else the number may by now be another message's; it comes again
-                    self.client.ack(message.mid, message.qos)
+            for connection, message, _ in batch:
+                self._acknowledge(connection, message)
 
-        return Batch([bytes(message.payload) for _, message in batch], acknowledge)
+        return Batch(payloads, acknowledge)
+
+    def _payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
+        """Return a message in our form as it is, and of another topic what the sources read in it."""
+        if self._translator is None or message.topic.startswith(self._prefix):
+            return [bytes(message.payload)]
+        return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)
+
+    def _acknowledge(self, connection: int, message: MQTTMessage) -> None:
+        if connection == self._connection:  # else the number may by now be another message's; it comes again
+            self.client.ack(message.mid, message.qos)
 
     def _on_message(self, client: Client, data: object, message: MQTTMessage) -> None:
         """Hold a message; while too many are held, block the client's thread so that no more are read."""
         with self.room:
             self.room.wait_for(lambda: len(self._held) < HELD or not self.open)
-            self._held.append((self._connection, message))
+            self._held.append((self._connection, message, datetime.now(UTC)))
             if self.open:
                 self._loop.call_soon_threadsafe(self._came.set)
 
@@ -130,7 +149,8 @@ class _Reader(_Connection):
         super().connected(client, data, flags, code, more)
         self._connection += 1
         if not code.is_failure:
-            client.subscribe(f"{self.address.topic}/in/{self._below}", AT_LEAST_ONCE)
+            topics = [] if self._translator is None else self._translator.sources.topics
+            client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._below}", *topics)])
 
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object

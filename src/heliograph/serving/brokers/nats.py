@@ -23,8 +23,10 @@ from nats.js.api import (
 from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
+from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import WHOLE, Batch, Part, Retry, TakenOverError, still_needed, word
 from heliograph.serving.brokers.url import Address
+from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 MOST = 1000  # messages of a batch
@@ -46,8 +48,8 @@ class Nats:
     number are stored too.
     """
 
-    def __init__(self, address: Address, part: Part = WHOLE):
-        self.address, self.part = address, part
+    def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
+        self.address, self.part, self._translator = address, part, translator
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")
         self._client = Client()
@@ -78,7 +80,22 @@ class Nats:
                 self._reader = None
                 continue
             self._read = count
-            return Batch([message.data for message in messages], partial(self._acknowledge, messages[-1]))
+            payloads = [payload for message in messages for payload in self._payloads(message)]
+            if payloads:
+                return Batch(payloads, partial(self._acknowledge, messages[-1]))
+            await self._acknowledge(messages[-1])  # topics that nobody reads
+
+    def _payloads(self, message: Msg) -> Sequence[Payload]:
+        """Return a message in our form as it is, and of another subject what the sources read in it."""
+        if self._translator is None or message.subject.startswith(f"{self.topic}.in."):
+            return [message.data]
+        return self._translator.read(message.subject.replace(".", "/"), message.data, message.metadata.timestamp)
+
+    @property
+    def _subjects(self) -> list[str]:
+        """Return the subjects of the sources, with the wildcards of NATS."""
+        topics = [] if self._translator is None else self._translator.sources.topics
+        return [topic.replace("/", ".").replace("+", "*").replace("#", ">") for topic in topics]
 
     async def _acknowledge(self, last: Msg) -> None:
         """Acknowledge everything up to this message; if the server misses it, the messages come again as duplicates."""
@@ -177,7 +194,8 @@ class Nats:
             ack_policy=AckPolicy.ALL,
             ack_wait=UNTOUCHED,
             max_ack_pending=4 * MOST,
-            filter_subject=f"{self.topic}.in.{self.part.number}.*" if self.part.of > 1 else f"{self.topic}.in.*",
+            filter_subject=f"{self.topic}.in.{self.part.number}.*" if self.part.of > 1 else None,
+            filter_subjects=None if self.part.of > 1 else [f"{self.topic}.in.*", *self._subjects],
         )
 
     async def _made(self, server: JetStreamContext) -> int:
@@ -191,7 +209,8 @@ class Nats:
         source, parts = f"{self.topic}.in.*", self.part.of
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
         transform = SubjectTransform(source, target) if parts > 1 else None
-        expected = StreamConfig(self.stream, subjects=[source], storage=StorageType.FILE, subject_transform=transform)
+        subjects = [source, *self._subjects]
+        expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
         result = await _stream(server, expected)
         known = result.config.subject_transform
         if (known.dest if known else None) != (target if transform else None):
@@ -200,9 +219,12 @@ class Nats:
 
 
 async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
-    """Return the stream of this name, made if there is none."""
+    """Return the stream of this name, made if there is none, with all subjects that are expected."""
     try:
-        return await server.stream_info(str(expected.name))
+        result = await server.stream_info(str(expected.name))
+        if set(expected.subjects or ()) <= set(result.config.subjects or ()):
+            return result
+        return await server.update_stream(result.config.evolve(subjects=expected.subjects))
     except NotFoundError:
         return await server.add_stream(expected)
 

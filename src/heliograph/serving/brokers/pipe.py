@@ -5,8 +5,9 @@ import os
 from collections.abc import Callable, Sequence
 
 from heliograph.disk.whole_file import naming
+from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import Batch, nothing
-from heliograph.serving.message import LONGEST
+from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
 READ = 1 << 18  # bytes that are read at once
@@ -21,10 +22,11 @@ class Pipe:
     Args:
         source: file descriptor of the messages (default 0, standard input).
         target: file descriptor of the outputs (default 1, standard output).
+        translator: what reads lines with a topic of others; None takes every line for a message.
     """
 
-    def __init__(self, source: int = 0, target: int = 1):
-        self.source, self.target = source, target
+    def __init__(self, source: int = 0, target: int = 1, translator: Translator | None = None):
+        self.source, self.target, self._translator = source, target, translator
         self._rest, self._skipping = b"", False
 
     async def receive(self) -> Batch | None:
@@ -33,8 +35,13 @@ class Pipe:
             await _ready(self.source, loop.add_reader, loop.remove_reader)
             with naming("standard input"):
                 data = os.read(self.source, READ)
-            if lines := self._lines(data):
-                return Batch(lines, nothing)
+            lines = self._lines(data)
+            if self._translator is None:
+                payloads: list[Payload] = list(lines)
+            else:
+                payloads = [payload for line in lines for payload in self._translator.line(line)]
+            if payloads:
+                return Batch(payloads, nothing)
             if not data:
                 return None
 

@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 
 from heliograph.numerics.check import fail, table, text
 
-PORTS = {"mqtt": 1883, "mqtts": 8883, "nats": 4222, "nats+tls": 4222}
+PORTS = {"mqtt": 1883, "mqtts": 8883, "nats": 4222, "nats+tls": 4222, "opc.tcp": 4840}
 SECURE = ("mqtts", "nats+tls")
 TOPIC = "heliograph"  # where messages are, if the URL does not say
 USER, PASSWORD = "HELIOGRAPH_BROKER_USER", "HELIOGRAPH_BROKER_PASSWORD"
@@ -20,7 +20,7 @@ class Address:
     """Address of a broker; printed it is the URL without user and password.
 
     Args:
-        kind: "mqtt" or "nats".
+        kind: "mqtt", "nats" or "opc.tcp".
         host: name or address of the machine.
         port: port number.
         topic: topic under which a service's messages are.
@@ -54,14 +54,14 @@ class Address:
 
 
 def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
-    """A broker's URL: `mqtt`, `mqtts`, `nats` or `nats+tls`, ://user:password@host:port/topic; the host must be there.
+    """A broker's URL, SCHEME://user:password@host:port/topic, as an address; the host must be there.
 
     User and password are taken from HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD if these are set, since other
     users of the machine would see them in a URL.
 
     Args:
-        url: SCHEME://user:password@host:port/topic, where SCHEME is `mqtt`, `mqtts`, `nats` or `nats+tls`; only scheme
-            and host are required.
+        url: SCHEME://user:password@host:port/topic, where SCHEME is `mqtt`, `mqtts`, `nats`, `nats+tls` or `opc.tcp`;
+            only scheme and host are required.
         environment: environment variables; by default those of the process.
 
     Raises:
@@ -78,11 +78,14 @@ def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
         raise fail("broker", shape, "an address that cannot be read") from None
     if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
         raise fail("broker", shape, f"{parts.scheme}://{host or ''}")
+    user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
+    password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
+    if parts.scheme == "opc.tcp":
+        path = unquote(parts.path).strip("/")
+        return Address("opc.tcp", host, port or PORTS[parts.scheme], path, False, user, password)
     # Words of the topic must be valid in MQTT and NATS.
     topic = unquote(parts.path).strip("/") or TOPIC
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
-    user = environment.get(USER) or (unquote(parts.username) if parts.username else None)
-    password = environment.get(PASSWORD) or (unquote(parts.password) if parts.password else None)
     kind = "mqtt" if parts.scheme.startswith("mqtt") else "nats"
     return Address(kind, host, port or PORTS[parts.scheme], topic, parts.scheme in SECURE, user, password)

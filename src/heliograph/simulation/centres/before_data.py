@@ -197,7 +197,7 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
 
     separate, _, _, known, _ = filters.init()
     nodes, n = known[0].errors.bias.shape
-    items = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
+    items = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
     start = separate, initial_factors(known[0].errors, items * len(u))
     result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
     return result

@@ -37,7 +37,7 @@ from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 
-class Listening(Module):
+class ObservationModel(Module):
     """Sensors and channels of nodes of one structure, stacked; the nodes share none of them."""
 
     sensor: AnySensor
@@ -83,7 +83,7 @@ class AbstractObservation(Module):
 class Apart(AbstractObservation):
     """Nodes that share nothing, by groups; `order` brings them into the order of the nodes."""
 
-    groups: tuple[Listening, ...]
+    groups: tuple[ObservationModel, ...]
     order: np.ndarray
     size: int = eqx.field(static=True)
 
@@ -123,7 +123,7 @@ class Centre(Module):
     """
 
     plant: AnyPlant
-    listening: AbstractObservation
+    observation_model: AbstractObservation
     rules: dict[str, AbstractInformedFusion]
     order: np.ndarray
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -149,7 +149,7 @@ class Centre(Module):
         """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
-        observation = self.listening.observe(*moved_state(mean, covariance, motion), k)
+        observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
         return motion, error_step(local, motion, observation), observation.noise
 
     def gathered(self, parts: Sequence[Plan]) -> Plan:
@@ -181,9 +181,9 @@ class Centre(Module):
         return CentreState(happened.errors, after), results
 
 
-def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Listening:
+def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
     """Stack nodes of one structure."""
-    return Listening(stack(list(sensors)), stack([described(channel) for channel in channels]))
+    return ObservationModel(stack(list(sensors)), stack([described(channel) for channel in channels]))
 
 
 def described(channel: Channel) -> SecondOrder | OverTime:

@@ -23,11 +23,11 @@ from heliograph.simulation.centres.centre import (
     Together,
     along_estimates,
     described,
-    listening,
+    observation_model,
 )
 from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.linearised import LinearisedCentre
-from heliograph.simulation.centres.uplinks import Drawn, Flying, Uplinks
+from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.side_by_side import over_all, started
@@ -98,13 +98,13 @@ class Reporting(Module):
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
 
-    def init(self) -> tuple[Flying, PyTree]:
+    def init(self) -> tuple[InFlight, PyTree]:
         """Return the state before any report is sent."""
         return self.uplinks.init(), started(self.centre)
 
     def step(
-        self, state: tuple[Flying, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
-    ) -> tuple[tuple[Flying, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
+        self, state: tuple[InFlight, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
+    ) -> tuple[tuple[InFlight, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
         """Send the nodes' means, and use what arrives: state, estimate, traffic, and each report with its delay."""
         flying, known = state
         means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
@@ -170,7 +170,7 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return Centre(
         plant=network.plant,
-        listening=_observe(network, mine, groups, order, size),
+        observation_model=_observe(network, mine, groups, order, size),
         rules=rules,
         order=order,
         sources=sources,
@@ -198,5 +198,5 @@ def _observe(
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
         return Together(network.common.sensor, described(network.common.channel), np.array(padded))
     parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
-    items = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    items = tuple(observation_model([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
     return Apart(items, order, size)

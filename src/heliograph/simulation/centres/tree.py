@@ -21,7 +21,7 @@ from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.simulation.centres.centre import Apart, Centre, Listening, described
+from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.side_by_side import Alike
@@ -146,7 +146,7 @@ def _followed(
     channels = eqx.filter_vmap(lambda item: described(node(item).channel))(numbers)
     alike = Alike(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
-    observe = Apart((Listening(nodes.sensor, channels),), np.arange(count), size)
+    observe = Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size)
     centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")
     quiet = jnp.zeros((count, size))
 

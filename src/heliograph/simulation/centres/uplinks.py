@@ -47,7 +47,7 @@ class SentReports(NamedTuple):
     delay: ArrayLike
 
 
-class Flying(NamedTuple):
+class InFlight(NamedTuple):
     """Reports in transit, by the steps since they were sent, from one; their delays; and the quantizers' states."""
 
     values: jax.Array
@@ -83,13 +83,13 @@ class Uplinks(Module):
         there = np.arange(max(self.received)) < np.array(self.received)[:, None]
         return np.flatnonzero(np.broadcast_to(there, (self.delay.shape[1], *there.shape)))
 
-    def init(self) -> Flying:
+    def init(self) -> InFlight:
         """Return the state with no report in transit."""
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)
         begin = eqx.filter_vmap(lambda q: q.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes)
         start = () if self.quantizers is None else begin(self.quantizers)
-        return Flying(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
+        return InFlight(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
 
     def draw(self, key: jax.Array, k: jax.Array) -> Drawn:
         """Draw the uplinks of step k in the run with this key; the same for all fusions of the same nodes."""
@@ -157,8 +157,8 @@ class Uplinks(Module):
         return jnp.argmax(jnp.asarray(self.delay), axis=1)
 
     def send(
-        self, state: Flying, means: jax.Array, drawn: Drawn, k: jax.Array
-    ) -> tuple[Flying, jax.Array, dict[str, jax.Array]]:
+        self, state: InFlight, means: jax.Array, drawn: Drawn, k: jax.Array
+    ) -> tuple[InFlight, jax.Array, dict[str, jax.Array]]:
         """Send the reports of step k: next state, received values (node, m), whenever they arrive, and their traffic.
 
         A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
@@ -178,7 +178,7 @@ class Uplinks(Module):
         z = jnp.einsum("imn,in->im", drawn.gain, values) + drawn.offset
         return state, jnp.where(beyond[:, None], jnp.inf, z), traffic
 
-    def arrive(self, state: Flying, sent: jax.Array, delay: Array) -> tuple[Flying, jax.Array]:
+    def arrive(self, state: InFlight, sent: jax.Array, delay: Array) -> tuple[InFlight, jax.Array]:
         """Return the next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
         values = jnp.concatenate([sent[None], state.values])
         delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])

@@ -16,6 +16,9 @@ def reports_by_name(
     """Reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
     result: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
+        if name in network.meshes:
+            result[name] = _arrivals(network, name, np.asarray(values))
+            continue
         fusion = network.fused[name]
         assert isinstance(fusion, Fusion)  # no other rule uses reports
         nodes, n = network.nodes_with(fusion.filter), len(network.states)
@@ -24,6 +27,18 @@ def reports_by_name(
             node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
             for i, node in enumerate(nodes)
         }
+    return result
+
+
+def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
+    """Messages that arrived from each node's neighbours, 1 or NaN (..., rounds times neighbours), and no delays."""
+    neighbours = network.meshes[name].neighbours or {}
+    result = {}
+    for i, node in enumerate(network.mesh_nodes(name)):
+        if count := len(neighbours[node]):
+            flags = arrived[..., i, :, 1 : count + 1]
+            values = np.where(flags, 1.0, np.nan).reshape(*flags.shape[:-2], -1)
+            result[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return result
 
 
@@ -54,7 +69,9 @@ def by_name(
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """
     result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
-    for (group, filters), part in zip(network.kinds, batch["estimates"], strict=True):
+    parts = batch["estimates"]
+    kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
+    for (group, filters), part in zip(kinds, parts, strict=True):
         values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
         for name, rows in zip(filters, values, strict=True):
             for node, row in zip(network.groups[group], rows, strict=True):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 import jax
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
@@ -38,6 +39,12 @@ if TYPE_CHECKING:  # extras
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
+ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
+Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
+Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
+Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
+
+
 @readable
 @dataclass(frozen=True)
 class Record(Saved):
@@ -60,13 +67,13 @@ class Record(Saved):
     time: np.ndarray
     states: tuple[str, ...]
     truth: np.ndarray | None
-    measurements: dict[str, np.ndarray]
-    estimates: dict[str, dict[str, Estimate]]
-    uplinks: dict[str, Uplink] = field(default_factory=dict)
+    measurements: ByNode
+    estimates: Estimates
+    uplinks: Uplinks = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
-    reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
-    transmissions: dict[str, np.ndarray] = field(default_factory=dict)
+    reports: Reports = field(default_factory=dict)
+    transmissions: ByNode = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
@@ -160,8 +167,8 @@ class Record(Saved):
         # Estimates and measurements with their places.
         results = [
             ((nodes.index(node), filters.index(name)), estimate)
-            for node, estimate_ in self.estimates.items()
-            for name, estimate in estimate_.items()
+            for node, by_name in self.estimates.items()
+            for name, estimate in by_name.items()
         ]
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         most = max((z.shape[-1] for _, z in received), default=0)

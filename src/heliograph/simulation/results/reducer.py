@@ -125,7 +125,7 @@ class Trajectories(AbstractReducer[Record]):
     def others(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
         """Return the record with `smoothed`, whose time is that of the last steps if there are fewer."""
         estimates = {
-            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
+            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.estimates.items()
         }
         time = result.time[-len(smoothed.time) :]

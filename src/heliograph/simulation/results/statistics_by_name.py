@@ -157,9 +157,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the row says in how many runs it failed
             for node, filters in self.items():
-                for name, filter_ in filters.items():
+                for name, score in filters.items():
                     index.append((node, name))
-                    rows.append(_summary(filter_, self.states))
+                    rows.append(_summary(score, self.states))
         names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
         return pd.DataFrame(rows, index=names)
 
@@ -191,9 +191,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         """
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():
-            lines += [f"{node}/{name}: {filter_.failure}" for name, filter_ in filters.items() if filter_.failed_runs]
-            for name, filter_ in filters.items():
-                for single, share in (filter_.uplink.saturated_share() if filter_.uplink else {}).items():
+            lines += [f"{node}/{name}: {score.failure}" for name, score in filters.items() if score.failed_runs]
+            for name, score in filters.items():
+                for single, share in (score.uplink.saturated_share() if score.uplink else {}).items():
                     if share:
                         lines.append(
                             f"{node}/{name}: the quantizer of node {single} saturated in {share:.2%} of samples"

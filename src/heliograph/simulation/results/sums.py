@@ -172,8 +172,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
         """Make the statistics by node and filter."""
         # Sums by kind and fusion, then by name.
-        count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
-        kinds = len(network.kinds)
+        every = network.kinds + network.mesh_kinds
+        count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in every])
+        kinds = len(every)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
         axes = enumerate((-3, -2, -3, -2, -2))
         items = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
@@ -199,7 +200,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
     ) -> StatisticsByName:
         """Return the statistics with `smoothed`."""
         results = {
-            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
+            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.items()
         }
         result.smoothed = StatisticsByName(results, smoothed.states)

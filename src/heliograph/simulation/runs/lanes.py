@@ -100,4 +100,4 @@ def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
     result = np.empty_like(recorded)
     result[used] = recorded
-    return result.reshape(-1, *recorded.shape[2:])
+    return result.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

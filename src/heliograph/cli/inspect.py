@@ -1,0 +1,66 @@
+"""`heliograph inspect`: the topics of a bag or a broker, and sources to paste."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def inspect(
+    recording: str,
+    /,
+    *,
+    network: Annotated[
+        str, Parameter(help="Its nodes and inputs are listed: my_network.py, or my_network.py:name.")
+    ] = "",
+    seconds: Annotated[float, Parameter(help="How long to listen to a broker.")] = 10.0,
+) -> None:
+    """List the topics of a bag or of a broker: rates, gaps and lateness, and `sources` to paste into a network's file.
+
+    Parameters
+    ----------
+    recording:
+        A bag (.mcap, .db3, .bag, or a folder), or the URL of a broker, mqtt:// or nats://.
+    """
+    import rich.console
+    import rich.markup
+    import rich.table
+
+    from heliograph.disk.quoting import visible
+    from heliograph.files.inspection import inspect_bag, suggestion
+    from heliograph.numerics.check import TINY, scalar
+    from heliograph.report.progress import progress
+
+    scalar("--seconds", seconds, TINY, 86400)
+    broken = ""
+    names: dict[str, tuple[str, ...]] = {}
+    if network:
+        from heliograph.files.network_file import load_network
+
+        loaded = load_network(network)
+        names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
+    # Look at the bag, or listen for a while.
+    with progress(2) as advance:
+        if "://" in recording:
+            from heliograph.serving.brokers.listening import listen
+            from heliograph.serving.brokers.url import address
+
+            advance(f"listening for {seconds:g} s")
+            topics = listen(address(recording), seconds)
+        else:
+            topics, broken = inspect_bag(
+                Path(recording), lambda done, total: advance(f"reading {recording}", done, total)
+            )
+    # A table, and what to paste.
+    table = rich.table.Table(
+        "topic", "type", "messages", "rate", "largest gap", "late (s): median, 95 %, most", box=None
+    )
+    for name, topic in sorted(topics.items()):
+        table.add_row(*map(rich.markup.escape, map(visible, (name, *topic.row()))))
+    console = rich.console.Console(width=None if sys.stdout.isatty() else 160, highlight=False)
+    console.print(table if topics else "no messages")
+    if topics:
+        print(suggestion(topics, names))
+    if broken:
+        print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)

@@ -1,0 +1,225 @@
+"""Bags of ROS: MCAP and SQLite files, folders of them, and bags of ROS 1, read by the sources of a network."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from heliograph.files.cut_bag import is_cut, whole_part
+from heliograph.files.event_table import EventTable
+from heliograph.files.sources import Sources
+from heliograph.numerics.check import InputError, fail, shown_error
+from heliograph.simulation.network import Network
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+BAGS = (".mcap", ".db3", ".bag")
+OFTEN = 5000  # messages between two reports of progress
+LISTED = 8  # topics in one line
+Progress = Callable[[int, int], None]
+
+
+class BagMessage(NamedTuple):
+    """Message of a bag: its topic and type, the time it was logged in nanoseconds, and its content."""
+
+    topic: str
+    type: str
+    logged: int
+    content: object
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is that of a bag: a file that ends in .mcap, .db3 or .bag, or a folder of ROS 2."""
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
+
+
+def read_bag(path: Path, network: Network, table: object, progress: Progress | None = None) -> EventTable:
+    """Read the events of a network from a bag; only the topics of its sources are decoded.
+
+    If the bag ends in the middle, or a message cannot be read, what came before stays, and `broken` of the result says
+    where it ended and why.
+
+    Args:
+        path: the bag.
+        network: the network.
+        table: sources by topic.
+        progress: called with the numbers of messages read and to be read.
+
+    Raises:
+        ValueError: no bag, sources that do not fit the network, or none whose topic is in the bag; one line.
+        ModuleNotFoundError: rosbags is not installed (extra "bags").
+    """
+    sources, result = Sources(table, network), EventTable(network)
+    with opened(path) as (reader, cut):
+        result.broken = cut
+        counts = Counter[str]()
+        for connection in reader.connections:
+            counts[connection.topic] += connection.msgcount
+        if cut and not counts:
+            raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
+        used = [topic for topic in counts if sources.of(topic)]
+        if not used:
+            raise fail(f"{path}", f"a topic of the sources, {_listed(sources.topics)}", f"only {_listed(counts)}")
+        _check_types(path, reader, sources)
+        # Each message becomes events; the first that cannot be read ends the reading.
+        total, done = sum(counts[topic] for topic in used), 0
+        try:
+            for done, message in enumerate(messages(path, reader, used), 1):
+                if progress is not None and done % OFTEN == 0:
+                    progress(done, total)
+                try:
+                    readings = sources.read(message.topic, message.content, message.topic)
+                except InputError as error:
+                    raise InputError(f"{path}, message {done}, logged at {moment(message.logged)}, {error}") from None
+                for reading in readings:
+                    result.add(reading, message.logged)
+        except InputError as error:
+            if not len(result):
+                raise
+            result.broken = f"{error}; what was read before it stays"
+    # Say which topics of either side were left out.
+    rest = {topic: count for topic, count in counts.items() if topic not in used}
+    if rest:
+        result.notes.append(f"{path}: not among the sources: {_counted(rest)}")
+    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
+    if missing:
+        result.notes.append(f"{path}: not in the bag: {_listed(missing)}")
+    return result
+
+
+@contextmanager
+def opened(path: Path) -> "Iterator[tuple[AnyReader, str]]":
+    """Open a bag for reading; of an MCAP file that was cut off, what is whole, and a line that says so, else "".
+
+    Raises:
+        ValueError: no bag, or one that cannot be opened; one line that names it.
+    """
+    if not path.exists():
+        raise fail(str(path), "a bag", "nothing of that name")
+    with ExitStack() as stack:
+        place, cut = path, ""
+        if path.suffix.lower() == ".mcap" and is_cut(path):
+            place, end = stack.enter_context(whole_part(path))
+            got = f"one that was cut off after {end:,} bytes of whole records"
+            cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
+        yield stack.enter_context(_reader(path, place)), cut
+
+
+@contextmanager
+def _reader(path: Path, place: Path) -> "Iterator[AnyReader]":
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        # Types of ROS itself, for bags of releases that did not write them into the bag.
+        reader = AnyReader([place], default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    except Exception as error:  # whatever a damaged file makes a reader do
+        raise fail(str(path), "a bag that can be opened", _reason(error)) from None
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[BagMessage]:
+    """Yield the messages of topics in the order in which they were logged.
+
+    Raises:
+        ValueError: damage, a type that the bag does not define, a topic that changes its type; one line with the place.
+    """
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    types, raw = dict[str, str](), reader.messages(connections) if connections else iter(())
+    count, last = 0, 0
+    while True:
+        # The next message as bytes.
+        try:
+            connection, logged, data = next(raw)
+        except StopIteration:
+            return
+        except Exception as error:
+            after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
+            raise fail(f"{path}, {after}", "a bag without damage", _reason(error)) from None
+        # Its content, of the type that its topic had before.
+        kind = connection.msgtype
+        if types.setdefault(connection.topic, kind) != kind:
+            where = f"{path}, {connection.topic}, logged at {moment(logged)}"
+            raise fail(where, f"messages of {types[connection.topic]}, as before", kind)
+        try:
+            content = reader.deserialize(data, kind)
+        except Exception as error:
+            where = f"{path}, {connection.topic}, logged at {moment(logged)}"
+            raise fail(where, f"a message of {kind}", _reason(error)) from None
+        yield BagMessage(connection.topic, kind, logged, content)
+        count, last = count + 1, logged
+
+
+def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
+    """Yield dotted path and basic type of the fields of a message type; lists and what is in them are left out.
+
+    A type that the bag does not define has no fields.
+    """
+    from rosbags.interfaces import Nodetype
+
+    _, fields = reader.typestore.fielddefs.get(kind, ([], []))
+    for name, (node, of) in fields if depth else ():
+        if node == Nodetype.BASE:
+            yield prefix + name, str(of[0])
+        elif node == Nodetype.NAME:
+            yield from fields_of(reader, str(of), f"{prefix}{name}.", depth - 1)
+        else:
+            yield prefix + name, "list"
+
+
+def moment(nanoseconds: int) -> str:
+    """Put nanoseconds since 1970 into a date of ISO 8601."""
+    return f"{np.datetime64(nanoseconds, 'ns')}Z"
+
+
+def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
+    """Check before reading that each mapped field is in its topic's type, as far as the bag says."""
+    # Paths that the sources need of each topic, against the fields of its type.
+    for connection in reader.connections:
+        fields = dict(fields_of(reader, connection.msgtype))
+        needed = [
+            path_
+            for source, _ in sources.of(connection.topic)
+            for path_ in (*source.paths, source.time, source.sequence, source.plant)
+            if path_
+        ]
+        # What is needed is a field, a message with fields, or in a list.
+        if needed and not fields:
+            what = f"{path}, {connection.topic}"
+            raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
+        for path_ in needed:
+            if not _there(fields, path_):
+                raise fail(
+                    f"{path}, {connection.topic}",
+                    f"a field {path_!r} in {connection.msgtype}",
+                    f"only {_listed(list(fields), 24)}",
+                )
+
+
+def _there(fields: dict[str, str], path: str) -> bool:
+    """Return whether a path is a field, a stamp or another message, or in a list."""
+    lists = [name for name, kind in fields.items() if kind == "list"]
+    return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
+        path.startswith(f"{name}.") for name in lists
+    )
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(shown_error(error).split()).rstrip(".")
+
+
+def _listed(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return _listed([f"{topic} ({count})" for topic, count in counts.items()])

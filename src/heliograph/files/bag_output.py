@@ -1,0 +1,225 @@
+"""Estimates as a bag: an odometry message with its covariance, and a number for each state, for a viewer of bags."""
+
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.disk.output_file import check_output
+from heliograph.disk.whole_file import whole_file
+from heliograph.model.estimate import Claim, Estimate, is_sound
+from heliograph.numerics.check import fail, instance, text
+from heliograph.numerics.types import Float
+from heliograph.simulation.results.record import Record
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # rows of the covariance of a pose, and of a twist
+UNKNOWN = -1.0  # first entry of a covariance that is not known, as messages of ROS have it
+ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
+
+
+@dataclass(frozen=True)
+class Pose:
+    """States that are the pose and the twist of an odometry message, by name; an axis without a state stays at 0.
+
+    A network's file names it `pose`; without it states called x, y, z, roll, pitch, yaw and vx, vy, vz, vroll, vpitch,
+    vyaw are taken. Angles are in radians; velocities are those of the message, which are in the child's frame.
+
+    Args:
+        x, y, z: states of the position in metres.
+        roll, pitch, yaw: states of the rotation.
+        vx, vy, vz: states of the velocity.
+        vroll, vpitch, vyaw: states of the rate of rotation.
+        frame: name of the frame of the pose.
+        child: name of the frame that moves.
+    """
+
+    x: str | None = None
+    y: str | None = None
+    z: str | None = None
+    roll: str | None = None
+    pitch: str | None = None
+    yaw: str | None = None
+    vx: str | None = None
+    vy: str | None = None
+    vz: str | None = None
+    vroll: str | None = None
+    vpitch: str | None = None
+    vyaw: str | None = None
+    frame: str = "map"
+    child: str = "base_link"
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None:
+                text(f"pose, {name}", value)
+
+    def places(self, states: tuple[str, ...]) -> tuple[list[int | None], list[int | None]]:
+        """Return for each axis the place of its state, None if it has none: of the pose, and of the twist.
+
+        Raises:
+            ValueError: an unknown state.
+        """
+        named: list[str | None] = [getattr(self, name) for name in (*AXES, *(f"v{axis}" for axis in AXES))]
+        for name in named:
+            if name is not None and name not in states:
+                raise fail("pose", f"names of the states {', '.join(states)}", repr(name))
+        places = [None if name is None else states.index(name) for name in named]
+        return places[:6], places[6:]
+
+
+def pose_of(states: tuple[str, ...]) -> Pose:
+    """Return the pose of the states that are named after axes."""
+    axes = (*AXES, *(f"v{axis}" for axis in AXES))
+    return Pose(**{axis: axis for axis in axes if axis in states})
+
+
+def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = None, pose: Pose | None = None) -> None:
+    """Write the estimates of a record to an MCAP file, as a whole or not at all.
+
+    Topics are /NODE/FILTER/odometry if a state is on an axis of the pose, and a number for each state and deviation,
+    /NODE/FILTER/STATE and /NODE/FILTER/STATE/sd; only rows with sound estimates. A covariance that nobody claims begins
+    with -1, as messages of ROS say that it is unknown.
+
+    Args:
+        record: the result of `run`, or final estimates of events.
+        path: the file, ending in .mcap.
+        origin: date from which times are counted that are numbers; by default the beginning of 1970.
+        pose: states that are pose and twist; by default those named after axes.
+
+    Raises:
+        ValueError: another ending, a folder that cannot be written, a pose of unknown states.
+        ModuleNotFoundError: rosbags is not installed (extra "bags").
+    """
+    instance("record", record, Record, "a Record")
+    path = Path(path)
+    check_output(path, (".mcap",))
+    pose = pose_of(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
+    pose.places(record.states)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store = _types()
+    times = _nanoseconds(record.time, origin)
+    # The writer makes a folder; the file in it is complete in itself.
+    with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        place = Path(folder) / "bag"
+        with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            topics = {
+                topic: (writer.add_connection(topic, kind, typestore=store), kind)
+                for node, filters in record.estimates.items()
+                for name, estimate in filters.items()
+                for topic, kind in _topics(f"/{_word(node)}/{_word(name)}", record.states, estimate.claim, pose)
+            }
+            for stamp, topic, message in _messages(record, times, pose, store.types):
+                connection, kind = topics[topic]
+                writer.write(connection, stamp, store.serialize_cdr(message, kind))
+        shutil.move(place / f"{place.name}.mcap", partial)
+
+
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
+    """Convert times to nanoseconds since 1970: dates, or seconds or steps from an origin."""
+    if time.dtype.kind == "M":
+        return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
+    begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
+    return [begun + round(at * 1e9) for at in time.tolist()]
+
+
+def _word(name: str) -> str:
+    """Return a name as a word of a topic."""
+    return re.sub(r"\W", "_", name)
+
+
+def _topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
+    if any(place is not None for places in pose.places(states) for place in places):
+        yield f"{prefix}/odometry", ODOMETRY
+    for state in states:
+        yield f"{prefix}/{_word(state)}", NUMBER
+        if claim != "none":
+            yield f"{prefix}/{_word(state)}/sd", NUMBER
+
+
+def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Iterator[tuple[int, str, object]]:
+    """Yield time, topic and message of each estimate, in order of time."""
+    # Estimates as arrays, once for all rows.
+    number, places = types[NUMBER], pose.places(record.states)
+    moves = any(place is not None for part in places for place in part)
+    parts = [
+        (f"/{_word(node)}/{_word(name)}", np.asarray(e.mean), np.asarray(e.covariance), _claims(e), is_sound(e))
+        for node, filters in record.estimates.items()
+        for name, e in filters.items()
+    ]
+    # Row by row, in order of time.
+    for k, stamp in enumerate(times):
+        for prefix, mean, covariance, claims, sound in parts:
+            if not sound[k]:
+                continue
+            if moves:
+                bound = None if claims[k] == "none" else covariance[k]
+                yield stamp, f"{prefix}/odometry", _odometry(stamp, mean[k], bound, places, pose, types)
+            for i, state in enumerate(record.states):
+                yield stamp, f"{prefix}/{_word(state)}", number(float(mean[k, i]))
+                if claims[k] != "none":
+                    yield stamp, f"{prefix}/{_word(state)}/sd", number(float(np.sqrt(max(covariance[k, i, i], 0.0))))
+
+
+def _claims(estimate: Estimate) -> np.ndarray:
+    return np.asarray(estimate.claims)
+
+
+def _odometry(
+    stamp: int,
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"] | None,
+    places: tuple[list[int | None], list[int | None]],
+    pose: Pose,
+    types: Any,
+) -> object:
+    """Return an odometry message; `covariance` is None where none is claimed."""
+    geometry = "geometry_msgs/msg/"
+    vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
+    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, part) for part in places)
+    rotation = types[f"{geometry}Quaternion"](*_quaternion(*position[3:]))
+    there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
+    moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
+    return types[ODOMETRY](
+        header(types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), pose.frame),
+        pose.child,
+        types[f"{geometry}PoseWithCovariance"](there, bound),
+        types[f"{geometry}TwistWithCovariance"](moving, twist_bound),
+    )
+
+
+def _part(
+    mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
+) -> tuple[list[float], Float[np.ndarray, " 36"]]:
+    """Return the six numbers of pose or twist, and their covariance, row by row."""
+    numbers = [0.0 if place is None else float(mean[place]) for place in places]
+    bound = np.zeros((6, 6))
+    named = [(axis, place) for axis, place in enumerate(places) if place is not None]
+    if covariance is None:
+        bound[0, 0] = UNKNOWN
+    elif named:
+        there, states = np.array(named).T
+        bound[np.ix_(there, there)] = covariance[np.ix_(states, states)]
+    return numbers, bound.ravel()
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
+    (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )

@@ -1,0 +1,96 @@
+"""One step of a node that estimates from what arrived: weights of the estimates, then prediction and correction.
+
+With the estimates xhat_j of the step before and the measurements z_j of this one; sums over what arrived, the node's
+own included:
+
+  fused      xc = sum_j C_j xhat_j,  sum_j C_j = I,  of covariance Pc
+  predicted  A xc + b,  Pb = A Pc A' + Q
+  corrected  P = (Pb^-1 + S)^-1,  S = sum_j H_j' R_j^-1 H_j,  xhat+ = xb + P sum_j H_j' R_j^-1 (z_j - H_j xb)
+
+In one line, xhat+ = A xhat + b + sum_j M_j (xhat_j - xhat) + W sum_j H_j' R_j^-1 (z_j - H_j (A xhat + b)), with W = P,
+M_j = (I - W S) A C_j; the sum of M_j (xhat_j - xhat) needs no digits of xhat itself.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import add, identity, root, solve, symmetric, times, transpose
+from heliograph.numerics.types import Array, Bool, Float
+
+
+class Believed(NamedTuple):
+    """Knowledge of one node about the estimates that its neighbours sent, itself first, and which of them arrived.
+
+    Shapes: covariance (n, n) of the node itself; traces (degree,) of all covariances, information (degree, n, n), their
+    inverses; joint (degree, n, degree, n), None where it is not propagated; present (degree,).
+    """
+
+    covariance: Float[jax.Array, "n n"]
+    traces: Float[jax.Array, " degree"]
+    information: Float[jax.Array, "degree n n"]
+    joint: Float[jax.Array, "degree n degree n"] | None
+    present: Bool[jax.Array, " degree"]
+
+
+class Weights(NamedTuple):
+    """Weights C_j = front parts_j of the neighbours' estimates, and the covariance Pc of what is fused.
+
+    Shapes: front (n, n), parts (degree, n, n), covariance (n, n). Two factors, since intersections share the first.
+    """
+
+    front: Float[jax.Array, "n n"]
+    parts: Float[jax.Array, "degree n n"]
+    covariance: Float[jax.Array, "n n"]
+
+
+class Step(NamedTuple):
+    """Plant over one step, A and Q, and what the measurements say: S of those that arrived, and of all neighbours."""
+
+    matrix: Float[Array, "n n"]
+    noise: Float[Array, "n n"]
+    arrived: Float[Array, "n n"]
+    complete: Float[Array, "n n"]
+
+
+class Gains(NamedTuple):
+    """Gains of one node's step: M_j = front parts_j, of others than itself; W and F = I - W S; P.
+
+    Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n).
+    """
+
+    front: Float[jax.Array, "n n"]
+    parts: Float[jax.Array, "degree n n"]
+    gain: Float[jax.Array, "n n"]
+    innovation: Float[jax.Array, "n n"]
+    covariance: Float[jax.Array, "n n"]
+
+
+def gains_of(weights: Weights, step: Step) -> Gains:
+    """Gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
+    a = jnp.asarray(step.matrix)
+    predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
+    corrected, innovation = correct(predicted, jnp.asarray(step.arrived))
+    return Gains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
+
+
+@runs_last
+def correct(
+    predicted: Float[jax.Array, "n n *#runs"], information: Float[jax.Array, "n n *#runs"]
+) -> tuple[Float[jax.Array, "n n *#runs"], Float[jax.Array, "n n *#runs"]]:
+    """P = (Pb^-1 + S)^-1 and F = I - P S of a predicted Pb, which may be singular, and of information S.
+
+    With S = L L': P = Pb - Pb L (I + L' Pb L)^-1 L' Pb, then Joseph's form P = F Pb F' + P S P.
+    """
+    n = predicted.shape[0]
+    left = root(information)
+    cross = times(predicted, left)
+    inner = jnp.asarray(identity(n, predicted)) + symmetric(times(transpose(left), cross))
+    short = predicted - times(cross, solve(inner, transpose(cross)))
+    innovation = jnp.asarray(identity(n, predicted)) - times(short, information)
+    pushed = times(short, left)
+    long = add([times(times(innovation, predicted), transpose(innovation)), times(pushed, transpose(pushed))])
+    return symmetric(long), innovation

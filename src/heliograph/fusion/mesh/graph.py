@@ -1,0 +1,166 @@
+"""Graphs of nodes that estimate from their neighbours' messages: who receives whom, and whom through others."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from heliograph.numerics.check import array, fail, items, scalar, shown, table
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
+
+
+@runtime_checkable
+class GraphLike(Protocol):
+    """A graph as networkx has it: `edges()` yields pairs of names, sender first where it `is_directed()`."""
+
+    def edges(self) -> Iterable[Any]:
+        """Pairs of names."""
+
+    def nodes(self) -> Iterable[Any]:
+        """Names of the nodes."""
+
+    def is_directed(self) -> bool:
+        """Test whether a pair is one way."""
+
+
+FEW = 64  # nodes whose rows stay together
+PARTS = (0.4, 0.75, 0.95, 1.0)  # shares of the nodes up to the longest row of each part
+Neighbours = Mapping[str, Sequence[str]] | GraphLike
+
+
+class Graph(NamedTuple):
+    """Neighbours by place, in rows of one length: each node itself, those it receives, then itself again as padding.
+
+    There is a row for each of the nodes, or for some of them.
+
+    Shapes: senders (node, degree), present (node, degree): False for padding.
+    """
+
+    nodes: tuple[str, ...]
+    senders: Int[np.ndarray, "node degree"]
+    present: Bool[np.ndarray, "node degree"]
+
+    @property
+    def edges(self) -> Int[np.ndarray, "edge 2"]:
+        """Places of sender and receiver of every edge, receiver after receiver; a node itself is none."""
+        receiver, column = np.nonzero(self.present[:, 1:])
+        return np.stack([self.senders[receiver, column + 1], receiver], axis=1)
+
+    def buckets(self) -> "list[Graph]":
+        """Return parts of the rows, few neighbours first, without the padding that these do not need.
+
+        Arithmetic on a row costs by its length, up to its cube, and a graph's longest rows are few.
+        """
+        counts = self.present.sum(axis=1)
+        widths = {int(w) for w in np.quantile(counts, PARTS, method="higher")} if len(counts) > FEW else {counts.max()}
+        parts, least = [], 0
+        for width in sorted(widths):
+            rows = np.flatnonzero((counts > least) & (counts <= width))
+            parts.append(Graph(self.nodes, self.senders[rows, :width], self.present[rows, :width]))
+            least = width
+        return parts
+
+    def reach(self) -> csr_array:
+        """Matrix (node, node) with a one where a node receives another, itself included."""
+        receiver, column = np.nonzero(self.present)
+        ones = np.ones(len(receiver), dtype=np.int32)
+        return csr_array((ones, (receiver, self.senders[receiver, column])), shape=(len(self.nodes),) * 2)
+
+
+def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
+    """Return the names of those whom each node receives, from such a table or from a graph of networkx.
+
+    Raises:
+        ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
+    """
+    if isinstance(value, GraphLike):
+        pairs = [tuple(pair[:2]) for pair in value.edges()]
+        both = pairs if value.is_directed() else [*pairs, *(pair[::-1] for pair in pairs)]
+        listed: dict[Any, list[Any]] = {name: [] for name in value.nodes()}
+        for sender, receiver in both:
+            listed[receiver].append(sender)
+        value = listed
+    given = table("neighbours", value, "names of those whom a node receives (or a networkx graph of names)")
+    # Whom a node receives; a node that is named by others alone receives nobody.
+    results: dict[str, tuple[str, ...]] = {}
+    for name, senders in given.items():
+        results[name] = mine = tuple(items(f"neighbours of {name!r}", senders, "names"))
+        wrong = [sender for sender in mine if not isinstance(sender, str)]
+        if wrong:
+            raise fail(f"neighbours of {name!r}", "names", shown(wrong[0]))
+        if name in mine:
+            raise fail(f"neighbours of {name!r}", "other nodes (a node has its own message anyway)", repr(name))
+        if len(set(mine)) < len(mine):
+            twice = sorted({sender for sender in mine if mine.count(sender) > 1})
+            raise fail(f"neighbours of {name!r}", "each once", f"{twice} more than once")
+    for sender in {sender: None for mine in results.values() for sender in mine}:
+        results.setdefault(sender, ())
+    if not results:
+        raise fail("neighbours", "at least one node", "none")
+    return results
+
+
+def neighbours_within(
+    positions: Mapping[str, Float[ArrayLike, " axes"]], radius: Float[ArrayLike, ""]
+) -> dict[str, tuple[str, ...]]:
+    """Neighbours of nodes at these positions: every other node at most `radius` away.
+
+    Args:
+        positions: by node (axes,), in the unit of the radius.
+        radius: reach of a message, positive.
+
+    Returns:
+        Names of the neighbours by node, in the order of the positions: for `Fusion(..., neighbours=...)`.
+
+    Raises:
+        ValueError: no positions, positions of several lengths, a radius that is not positive.
+    """
+    given = table("positions", positions, "positions of nodes")
+    reach = float(scalar("radius", radius, np.finfo(float).tiny))
+    if not given:
+        raise fail("positions", "those of some nodes", "none")
+    rows = [array(f"position of {name!r}", place, ("axes",)) for name, place in given.items()]
+    if len({len(row) for row in rows}) > 1:
+        raise fail("positions", "as many numbers for each node", sorted({len(row) for row in rows}))
+    names = list(given)
+    near = cKDTree(np.array(rows)).query_ball_point(np.array(rows), reach)
+    return {
+        name: tuple(names[j] for j in sorted(mine) if j != i)
+        for i, (name, mine) in enumerate(zip(names, near, strict=True))
+    }
+
+
+def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> Graph:
+    """Return the graph of these nodes by place; each of the neighbours is among them."""
+    place = {name: i for i, name in enumerate(nodes)}
+    rows = [[i, *(place[sender] for sender in neighbours[name])] for i, name in enumerate(nodes)]
+    degree = max(map(len, rows))
+    senders = np.array([row + row[:1] * (degree - len(row)) for row in rows])
+    present = np.arange(degree) < np.array([len(row) for row in rows])[:, None]
+    return Graph(tuple(nodes), senders, present)
+
+
+def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
+    """Places of the nodes from which a directed path leads to each node, itself included; one array where all are.
+
+    Nodes of one strongly connected component share them.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    reach = graph.reach()
+    count, label = connected_components(reach, connection="strong")
+    members = [np.flatnonzero(label == c) for c in range(count)]
+    # Components that a component receives from, over all paths: a row of the reach is one of receivers.
+    direct = [set(label[reach[rows].indices].tolist()) for rows in members]
+    behind: list[set[int]] = []
+    for c in range(count):
+        seen, ahead = {c}, [c]
+        while ahead:
+            new = direct[ahead.pop()] - seen
+            seen |= new
+            ahead += new
+        behind.append(seen)
+    places = [np.sort(np.concatenate([members[c] for c in seen])) for seen in behind]
+    return [places[c] for c in label]

@@ -1,0 +1,173 @@
+"""Rules of fusion for neighbours: cheap shares of intersection, fixed shares, and best weights that were frozen."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.intersection import inverses, without_known
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
+from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.shares import intersection_weights, trace_shares
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import check_count, fail, scalar, table
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+SUM = 1e-9  # shares are decimal fractions, whose sum is 1 up to rounding
+
+
+class TraceIntersection(AbstractFusion):
+    """Covariance intersection with shares from the traces: proportional to (tr P_j)^-power, or equal.
+
+    Of the two the one whose fused covariance has the smaller trace: shares by trace alone ignore a neighbour of large
+    variance who alone knows some state. Nothing is searched, so it costs little on thousands of nodes.
+
+    Args:
+        power: of the traces; 4 by default.
+        improvements: steps of a multiplicative search from there towards the least trace; 0 by default.
+
+    Claim: "upper", whatever the losses, as `CovarianceIntersection`.
+
+    Source: Julier and Uhlmann (1997); Niehsen, Information fusion based on fast covariance intersection (2002).
+    """
+
+    power: float = eqx.field(static=True)
+    improvements: int = eqx.field(static=True)
+
+    def __init__(self, power: Float[ArrayLike, ""] = 4.0, improvements: int = 0):
+        self.power = float(scalar("power of the traces", power, 0.0))
+        self.improvements = check_count("improvements", improvements, 0)
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Lower the weakest claim to "upper" at most."""
+        if "none" in claims:
+            raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Intersect all of several estimates."""
+        information = inverses(covariances)
+        traces = jnp.trace(covariances, axis1=1, axis2=2)
+        believed = Believed(covariances[0], traces, information, None, jnp.ones(len(means), dtype=bool))
+        front, parts, covariance = self.neighbour_weights(believed)
+        off = jnp.einsum("jab,jb->a", parts, means - means[0])
+        return means[0] + front @ off, without_known(covariance, covariances)
+
+    def neighbour_weights(self, believed: Believed) -> Weights:
+        """Intersect what arrived."""
+        return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
+
+
+class DiffusionWeights(AbstractFusion):
+    """Fixed shares c_ij of the neighbours' estimates: diffusion, whose gains do not depend on what arrives.
+
+    xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with
+    the gains K_ij and F_i of a filter at i that receives all its neighbours' measurements and no estimate.
+
+    Args:
+        shares: c_ij of each node's neighbours by name, {"a": {"b": .3, ...}, ...}, not negative, with what is left of 1
+            for the node itself; by default equal shares of a node and all its neighbours.
+
+    Claim: "exact" between neighbours, by the joint covariance of all errors; a fusion centre cannot use it.
+
+    Raises:
+        ValueError: negative shares, or a node whose shares sum to more than one.
+
+    Source: Cattivelli and Sayed, Diffusion strategies for distributed Kalman filtering and smoothing (2010).
+    """
+
+    shares: Float[Array, "..."] | None
+    given: dict[str, dict[str, float]] | None
+
+    def __init__(self, shares: Mapping[str, Mapping[str, float]] | None = None):
+        self.shares, self.given = None, None
+        if shares is not None:
+            rows = table("diffusion shares", shares, "shares by neighbour")
+            self.given = {name: _checked(name, row) for name, row in rows.items()}
+
+    @property
+    def needs_joint(self) -> bool:
+        """Always True: the claim is the joint covariance's."""
+        return True
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: a fusion centre has no neighbours."""
+        raise fail("fusion by DiffusionWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+
+    def placed(self, graph: Graph) -> "DiffusionWeights":
+        """Return the rule with its shares in the rows of the graph, zero for the node itself."""
+        result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
+        if self.given is not None:
+            result = np.array([self._row(graph, i) for i in range(len(graph.senders))])
+        result[:, 0] = 0.0
+        placed: DiffusionWeights = eqx.tree_at(
+            lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None
+        )
+        return placed
+
+    def _row(self, graph: Graph, i: int) -> list[float]:
+        """Shares of node i in the graph's order."""
+        given = self.given or {}
+        name = graph.nodes[graph.senders[i, 0]]
+        mine = {n: share for n, share in given.get(name, {}).items() if n != name}
+        names = [graph.nodes[j] for j in graph.senders[i]]
+        known = {n for n, there in zip(names, graph.present[i], strict=True) if there}
+        if unknown := sorted(set(mine) - known):
+            raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(known - {name})}", unknown)
+        return [mine.get(n, 0.0) if there else 0.0 for n, there in zip(names, graph.present[i], strict=True)]
+
+    def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
+        """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
+        a = jnp.asarray(step.matrix)
+        predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
+        corrected, innovation = correct(predicted, jnp.asarray(step.complete))
+        assert self.shares is not None
+        shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
+        # What arrived alone corrects.
+        used = jnp.eye(len(a)) - corrected @ step.arrived
+        return Gains(innovation @ a, shares[:, None, None] * jnp.eye(len(a)), corrected, used, corrected)
+
+
+class FrozenWeights(AbstractFusion):
+    """Best weights for joint covariances of each neighbourhood that do not move: means over losses in the steady state.
+
+    `freeze` makes it. Weights are solved for what arrived at each step, from these blocks alone.
+
+    Args:
+        rule: the rule of best weights.
+        blocks: joint covariances (node, degree, n, degree, n) of each node and its neighbours, itself first.
+
+    Claim: "nominal": the blocks are means over drawn losses, of the steady state.
+    """
+
+    rule: AbstractFusion
+    blocks: Float[Array, "..."]
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: a fusion centre has no neighbours."""
+        raise fail("fusion by FrozenWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+
+    def placed(self, graph: Graph) -> "FrozenWeights":
+        """Return the rule with the blocks of the graph's rows."""
+        width = graph.senders.shape[1]
+        if len(self.blocks) != len(graph.nodes) or np.shape(self.blocks)[1] < width:
+            raise fail("frozen weights", f"blocks of {len(graph.nodes)} nodes and {width} of each or more",
+                       f"shape {np.shape(self.blocks)}")  # fmt: skip
+        return FrozenWeights(self.rule, np.asarray(self.blocks)[graph.senders[:, 0], :width, :, :width])
+
+    def neighbour_weights(self, believed: Believed) -> Weights:
+        """Weights of what arrived, and the covariance that the blocks give them."""
+        return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
+
+
+def _checked(name: str, row: object) -> dict[str, float]:
+    """Shares of one node: not negative, at most one in sum, and one where its own is among them."""
+    what = f"diffusion shares of {name!r}"
+    mine = {n: float(scalar(what, share, 0.0)) for n, share in table(what, row, "shares by neighbour").items()}
+    total = sum(mine.values())
+    if total > 1 + SUM or (name in mine and total < 1 - SUM):
+        raise fail(what, "shares that sum to 1", f"{total:g}")
+    return mine

@@ -1,0 +1,76 @@
+"""Best linear unbiased weights of the estimates that arrived, from the joint covariance of all neighbours' errors."""
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.fusion.intersection import inverse
+from heliograph.numerics.linalg import regular_solve
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import factor, minus
+from heliograph.numerics.types import Bool, Float
+
+SHORT = 24  # unknowns of equations that are solved side by side, operation by operation
+RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have on top of its own
+
+
+def arrived_weights(
+    joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
+) -> Float[jax.Array, "n degree n"]:
+    """Weights C (n, degree, n), sum_j C_j = I, of least C P C' for those that are `present`, zero for the others.
+
+    C = (E' U^-1 E)^-1 E' U^-1, E = [I; ...; I], U = P + RIDGE D, D the mean of the variances: the best weights of
+    estimates with a little independent error more. Without it weights of nearly equal estimates, such as those of the
+    first steps, grow without bound, and rounding with them. C P C' is the covariance whatever C is.
+    """
+    degree, n = joint.shape[:2]
+    there = present.astype(joint.dtype)
+    # In units of the deviations, absent ones apart.
+    variances = jnp.einsum("iaia,i->a", joint, there) / there.sum()
+    unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    both = there[:, None, None, None] * there[None, None, :, None]
+    scaled = (both * joint / (unit[:, None, None] * unit)).reshape(degree * n, degree * n)
+    total = scaled + jnp.diag(jnp.repeat(jnp.where(present, RIDGE, 1.0), n))
+    ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
+    # U^-1 E, and what makes the weights sum to I.
+    solved = _short_solve(total, ones) if degree * n <= SHORT else regular_solve(total, ones)
+    weights = (inverse(ones.T @ solved) @ solved.T).reshape(n, degree, n)
+    return unit[:, None, None] * weights / unit
+
+
+@runs_last
+def _short_solve(
+    a: Float[jax.Array, "n n *#runs"], b: Float[jax.Array, "n k *#runs"]
+) -> Float[jax.Array, "n k *#runs"]:
+    """A^-1 B of a regular A by its Cholesky factor, written out."""
+    columns, scales = factor(a)
+    n = len(a)
+    forward: list[jax.Array] = []
+    for i in range(n):  # L Y = B
+        forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
+    backward = forward[:]
+    for i in reversed(range(n)):  # L' X = Y
+        backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
+    return jnp.stack(backward)
+
+
+def arrived_weights_by_component(
+    joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
+) -> Float[jax.Array, "n degree n"]:
+    """Diagonal weights of those that are present: the best for each component of the state by itself."""
+    degree, n = joint.shape[:2]
+    component = jnp.einsum("iaja->aij", joint)
+
+    def single(item: jax.Array) -> jax.Array:
+        return arrived_weights(item.reshape(degree, 1, degree, 1), present)[0, :, 0]
+
+    return jnp.einsum("ai,ab->aib", jax.vmap(single)(component), jnp.eye(n))
+
+
+def arrived_scalar_weights(
+    joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
+) -> Float[jax.Array, "n degree n"]:
+    """One number for each of those that are present, of least trace."""
+    degree, n = joint.shape[:2]
+    traces = jnp.einsum("iaja->ij", joint)
+    single = arrived_weights(traces.reshape(degree, 1, degree, 1), present)[0, :, 0]
+    return jnp.einsum("i,ab->aib", single, jnp.eye(n))

@@ -1,0 +1,96 @@
+"""Messages that a broker passes on in a while, to see what there is."""
+
+import asyncio
+import threading
+import time
+
+from heliograph.files.inspection import Topic, note
+from heliograph.numerics.check import fail
+from heliograph.serving.brokers.url import Address
+
+WAIT = 10.0  # seconds that a connection may take
+INTERNAL = ("$", "_INBOX")  # topics and subjects of the broker itself
+
+
+def listen(address: Address, seconds: float) -> dict[str, Topic]:
+    """Listen to all topics of a broker for a while, and return them; nothing is acknowledged or stored.
+
+    Args:
+        address: the broker.
+        seconds: how long to listen.
+
+    Raises:
+        ValueError: no connection; one line that names the broker.
+    """
+    if address.kind == "opc.tcp":
+        raise fail(f"{address}", "mqtt:// or nats://, whose topics can be listened to", address.kind)
+    topics: dict[str, Topic] = {}
+    if address.kind == "mqtt":
+        _listen_mqtt(address, seconds, topics)
+    else:
+        asyncio.run(_listen_nats(address, seconds, topics))
+    return topics
+
+
+def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+    from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
+    from paho.mqtt.enums import CallbackAPIVersion
+    from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    ready = threading.Event()
+
+    def connected(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
+        if not code.is_failure:
+            client.subscribe("#", 0)
+            ready.set()
+
+    def message(client: Client, data: object, message: MQTTMessage) -> None:
+        if not message.retain:  # it says nothing of rate and lateness
+            note(topics, message.topic, bytes(message.payload), time.time_ns())
+
+    # Callbacks run in the client's thread while this one sleeps.
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.on_connect, client.on_message = connected, message
+    if address.user is not None:
+        client.username_pw_set(address.user, address.password)
+    if context := address.tls():
+        client.tls_set_context(context)
+    client.connect_async(address.host, address.port)
+    client.loop_start()
+    try:
+        if not ready.wait(WAIT):
+            raise fail(f"broker {address}", "a connection", f"none within {WAIT:g} s")
+        time.sleep(seconds)
+    finally:
+        client.disconnect()
+        client.loop_stop()
+
+
+async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+    import nats
+    from nats.aio.msg import Msg
+    from nats.errors import Error
+
+    async def message(item: Msg) -> None:
+        if not item.subject.startswith(INTERNAL):
+            note(topics, item.subject.replace(".", "/"), item.data, time.time_ns())
+
+    # Connect, listen for a while, and leave.
+    try:
+        client = await nats.connect(
+            f"nats://{address.host}:{address.port}",
+            user=address.user if address.password else None,
+            password=address.password,
+            token=None if address.password else address.user,
+            tls=address.tls(),
+            allow_reconnect=False,
+            connect_timeout=int(WAIT),
+        )
+    except (Error, OSError, TimeoutError) as error:
+        raise fail(f"broker {address}", "a connection", type(error).__name__) from None
+    try:
+        await client.subscribe(">", cb=message)
+        await asyncio.sleep(seconds)
+    finally:
+        await client.close()

@@ -1,0 +1,217 @@
+"""Values of an OPC UA server, which reports by exception: subscribed with the deadband that the server itself has."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from asyncua import Client, Node, ua
+from asyncua.common.subscription import DataChangeNotif
+from asyncua.ua.uaerrors import UaError
+
+from heliograph.model.trigger import SendOnDelta
+from heliograph.numerics.check import fail, items, shown, text
+from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.transport import Batch, Retry, nothing
+from heliograph.serving.brokers.url import Address, address
+from heliograph.serving.message import Payload
+from heliograph.serving.output import Output
+
+AWAY = (UaError, OSError, asyncio.TimeoutError)
+WAIT = 5.0  # seconds between two looks whether the connection is there, and that an answer may take
+FASTEST = 0.05  # seconds of a sampling interval that the server does not bound
+MOST = 1000  # values of a batch
+ABSOLUTE, OF_RANGE = 0, 3  # formats of an exception deviation: in the value's unit, in percent of its EURange
+
+
+class Reporting(NamedTuple):
+    """Rule by which a server reports a variable: where it left the deadband, looked at once in an interval.
+
+    Args:
+        deadband: change in the variable's unit that is not reported; 0 if the server states none.
+        interval: seconds between two samples; 0 if the server states none.
+    """
+
+    deadband: float
+    interval: float
+
+    def trigger(self, heartbeat: int | None = None) -> SendOnDelta:
+        """Return the sender of a node whose steps are the sampling intervals, for `hg.Node(..., trigger=...)`.
+
+        Args:
+            heartbeat: steps after which a value is sent in any case; None for never.
+
+        Raises:
+            ValueError: a server that states no deadband.
+        """
+        if self.deadband <= 0:
+            raise fail("deadband of the server", "a positive number", self.deadband)
+        return SendOnDelta(self.deadband, heartbeat)
+
+
+def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
+    """Read from an OPC UA server by which rule it reports variables: deadband and sampling interval.
+
+    The interval is the attribute MinimumSamplingInterval; the deadband the property ExceptionDeviation of the variable
+    or of its historical configuration, in its unit or in percent of the EURange.
+
+    Args:
+        url: address of the server, opc.tcp://host:port/path.
+        variables: identifiers of the variables, as "ns=2;s=Boiler.Temperature".
+
+    Raises:
+        ValueError: no server there, an unknown variable; one line.
+        ModuleNotFoundError: asyncua is not installed (extra "opcua").
+    """
+    where = address(url)
+    if where.kind != "opc.tcp":
+        raise fail("url", "opc.tcp://host:port/path", where.kind)
+    names = [text("variable", name) for name in items("variables", variables, "identifiers")]
+
+    async def work() -> dict[str, Reporting]:
+        async with Client(url, timeout=WAIT) as client:
+            return {name: await reporting_of(_node(client, name)) for name in names}
+
+    try:
+        return asyncio.run(work())
+    except AWAY as error:
+        raise fail(f"OPC UA server {where}", "an answer", f"{type(error).__name__} {error}") from None
+
+
+async def reporting_of(node: Node) -> Reporting:
+    """Return the rule by which a variable is reported, 0 for what the server does not state."""
+    interval = await _attribute(node, ua.AttributeIds.MinimumSamplingInterval)
+    # The deviation is a property of the variable, or of its historical configuration.
+    places = [node]
+    with contextlib.suppress(UaError):
+        places += await node.get_referenced_nodes(ua.ObjectIds.HasHistoricalConfiguration)
+    for place in places:
+        deviation = await _property(place, "ExceptionDeviation")
+        if deviation is None:
+            continue
+        kind = await _property(place, "ExceptionDeviationFormat")
+        bounds = await _property(node, "EURange")
+        if kind in (None, ABSOLUTE):
+            return Reporting(float(str(deviation)), max(interval, 0.0) / 1e3)
+        if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
+            share = float(str(deviation)) / 100
+            return Reporting(share * (bounds.High - bounds.Low), max(interval, 0.0) / 1e3)
+    return Reporting(0.0, max(interval, 0.0) / 1e3)
+
+
+class OpcUa:
+    """Transport from an OPC UA server: each change of a variable is a message of the topic that is its identifier.
+
+    A message is {"value": ..., "source_time": ..., "server_time": ...}; a value of bad quality is null. The server has
+    no place for estimates, which go to standard output. Nothing is acknowledged: what changes while nobody is
+    subscribed is lost, except for its last value.
+    """
+
+    def __init__(self, address: Address, translator: Translator, target: int = 1):
+        self.address, self._translator = address, translator
+        self._output, self._retry = Pipe(target=target), Retry(str(address))
+        self._came: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
+        self._client: Client | None = None
+        self._first: set[str] = set()  # variables of which the first value is still to come
+        self.reporting: dict[str, Reporting] = {}
+
+    async def receive(self) -> Batch | None:
+        while True:
+            await self._connected()
+            try:
+                payloads = list(await asyncio.wait_for(self._came.get(), WAIT))
+            except TimeoutError:
+                continue
+            while len(payloads) < MOST and not self._came.empty():
+                payloads += self._came.get_nowait()
+            if payloads:
+                return Batch(payloads, nothing)
+
+    async def publish(self, outputs: Sequence[Output]) -> None:
+        await self._output.publish(outputs)
+
+    async def close(self) -> None:
+        if self._client is not None:
+            with contextlib.suppress(*AWAY):
+                await asyncio.wait_for(self._client.disconnect(), WAIT)
+
+    def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
+        """Translate a change; the first value of a subscription was there before, as a stored message."""
+        name, value = node.nodeid.to_string(), data.monitored_item.Value
+        good = value.StatusCode is None or value.StatusCode.is_good()
+        content = {
+            "value": val if good and isinstance(val, bool | int | float) else None if not good else shown(val),
+            "source_time": _iso(value.SourceTimestamp),
+            "server_time": _iso(value.ServerTimestamp),
+        }
+        stored = name in self._first
+        self._first.discard(name)
+        body = json.dumps(content).encode()
+        self._came.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
+
+    async def _connected(self) -> None:
+        """Connect and subscribe, again and again while the server is away."""
+        while True:
+            try:
+                if self._client is not None:
+                    await self._client.check_connection()
+                    return
+                await self._subscribe()
+                self._retry.worked()
+                return
+            except AWAY as error:
+                if self._client is not None:
+                    with contextlib.suppress(*AWAY):
+                        await self._client.disconnect()
+                self._client = None
+                await self._retry.wait(error)
+
+    async def _subscribe(self) -> None:
+        client = Client(str(self.address), timeout=WAIT)
+        if self.address.user is not None:
+            client.set_user(self.address.user)
+            client.set_password(self.address.password or "")
+        await client.connect()
+        self._client = client
+        # Each variable with the deadband and the interval that the server states.
+        for name in self._translator.sources.topics:
+            node = _node(client, name)
+            rule = self.reporting[name] = await reporting_of(node)
+            interval = 1e3 * (rule.interval or FASTEST)
+            self._first.add(node.nodeid.to_string())
+            subscription = await client.create_subscription(interval, self)
+            if rule.deadband > 0:
+                await subscription.deadband_monitor(node, ua.Double(rule.deadband))
+            else:
+                await subscription.subscribe_data_change(node, sampling_interval=ua.Duration(interval))
+
+
+def _node(client: Client, name: str) -> Node:
+    try:
+        return client.get_node(name)
+    except (UaError, ValueError):
+        raise fail("variable of an OPC UA server", "an identifier as ns=2;s=Boiler.Temperature", repr(name)) from None
+
+
+async def _attribute(node: Node, attribute: ua.AttributeIds) -> float:
+    try:
+        value = (await node.read_attribute(attribute)).Value
+    except UaError:
+        return 0.0
+    return 0.0 if value is None or value.Value is None else float(value.Value)
+
+
+async def _property(node: Node, name: str) -> object:
+    for item in await node.get_properties():
+        if (await item.read_browse_name()).Name == name:
+            return await item.read_value()
+    return None
+
+
+def _iso(time: datetime | None) -> str | None:
+    if time is None:
+        return None
+    return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).isoformat()

@@ -1,0 +1,177 @@
+"""Edges between neighbours: a channel each, of which only matters what arrives."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.rules import Fusion
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, at, first, stack, structure, unstack
+from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import ArrayLike, Bool, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.random_affine.erasure import Erasure, arrived
+from heliograph.random_affine.modes import Modes
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.simulation.centres.uplinks import SentReports
+from heliograph.simulation.draws import checksum
+from heliograph.simulation.shared_fading import deliver, memory_places, start
+
+Recorded = Mapping[str, SentReports | ArrayLike]
+
+
+class EdgeGroup(Module):
+    """Channels of one structure, stacked; checksums of the edges' names, of their memories, and their places.
+
+    Shapes: checksums (edge,), memories (edge, memories of a channel), rows and columns (edge,) among the graph's.
+    """
+
+    channel: Channel
+    checksums: np.ndarray
+    memories: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+
+
+class Edges(Module):
+    """All edges of a fusion between neighbours; none of them loses anything where there are no groups."""
+
+    groups: tuple[EdgeGroup, ...]
+    present: np.ndarray
+    rounds: int = eqx.field(static=True)
+
+    def init(self, key: jax.Array) -> tuple[PyTree, ...]:
+        """Return the states of the channels before the first step."""
+
+        def single(group: EdgeGroup) -> PyTree:
+            return start(group.channel, key, group.checksums, group.memories)
+
+        return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
+
+    def draw(self, states: tuple[PyTree, ...], key: jax.Array, k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
+        """Draw what arrives at step k in each round: next states, and flags (node, rounds, degree)."""
+        rounds = []
+        # One exchange after another, each with its draws; channels with memory go on from one to the next.
+        for number in range(self.rounds):
+            flags, following = jnp.asarray(self.present), []
+            for group, state in zip(self.groups, states, strict=True):
+
+                def single(item: EdgeGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+                    channel = at(item.channel, k)
+                    sent = jnp.zeros(channel.inputs)
+                    state, z = deliver(channel, state, sent, key, count, item.checksums, item.memories)
+                    return state, ~jnp.any(jnp.isnan(z))
+
+                both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
+                state, arrives = both(group, state, k * self.rounds + number)
+                following.append(state)
+                flags = flags.at[group.rows, group.columns].set(arrives)
+            states = tuple(following)
+            rounds.append(flags)
+        return states, jnp.stack(rounds, axis=1)
+
+    def lossless(self) -> Bool[np.ndarray, "node rounds degree"]:
+        """Flags of a step at which everything arrives."""
+        return np.repeat(self.present[:, None], self.rounds, axis=1)
+
+    def recorded(
+        self, name: str, nodes: Sequence[str], reports: Recorded | None, steps: int
+    ) -> Bool[np.ndarray, "time node rounds degree"]:
+        """Flags of each step from a recording, (steps, rounds times neighbours) for each node that has neighbours.
+
+        Raises:
+            ValueError: nodes without flags or the reverse, shapes that do not fit.
+        """
+        result = np.repeat(self.lossless()[None], steps, axis=0)
+        # Everything arrives, unless a report says otherwise.
+        if reports is None and not self.groups:
+            return result
+        receivers = [node for node, there in zip(nodes, self.present, strict=True) if there[1:].any()]
+        if reports is None or set(reports) != set(receivers):
+            given = "none" if reports is None else list(reports)
+            raise fail(f"reports of fusion {name!r}", f"what arrived from the neighbours of {receivers}", given)
+        for i, node in enumerate(nodes):
+            if node not in reports:
+                continue
+            item = reports[node]
+            count = int(self.present[i, 1:].sum())
+            values = array(f"reports of node {node!r}", item.values if isinstance(item, SentReports) else item,
+                           (steps, self.rounds * count), missing=True)  # fmt: skip
+            result[:, i, :, 1 : count + 1] = ~np.isnan(values.reshape(steps, self.rounds, count))
+        return result
+
+
+def edges_of(fusion: Fusion, graph: Graph) -> Edges:
+    """Build the edges of a fusion between neighbours.
+
+    Raises:
+        ValueError: links of other edges, links that do more to a message than lose it, or of which nobody knows.
+    """
+    if fusion.link is None:
+        return Edges((), graph.present, fusion.rounds)
+    sender_receiver = graph.edges
+    names = [f"{graph.nodes[j]} to {graph.nodes[i]}" for j, i in sender_receiver]
+    if isinstance(fusion.link, Mapping) and set(fusion.link) != set(names):
+        wrong = sorted(set(fusion.link) ^ set(names))[:3]
+        raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
+    channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
+    for item in {id(channel): channel for channel in channels}.values():
+        check_edge(item)
+    # Edges with channels of one structure, by place in the graph's rows.
+    memories = memory_places(dict(zip(names, channels, strict=True)))
+    receivers, columns = np.nonzero(graph.present[:, 1:])
+    alike: dict[object, list[int]] = {}
+    for e, channel in enumerate(channels):
+        alike.setdefault(structure(anonymous(channel)), []).append(e)
+    groups = [_group(names, channels, memories, receivers, columns + 1, which) for which in alike.values()]
+    return Edges(tuple(groups), graph.present, fusion.rounds)
+
+
+def _group(
+    names: Sequence[str],
+    channels: Sequence[Channel],
+    memories: Mapping[str, np.ndarray],
+    rows: np.ndarray,
+    columns: np.ndarray,
+    which: Sequence[int],
+) -> EdgeGroup:
+    held = np.stack([memories[names[e]] for e in which])
+    channel = stack([anonymous(channels[e]) if held.shape[1] else channels[e] for e in which])
+    checksums = np.array([checksum(names[e]) for e in which], dtype=np.uint32)
+    return EdgeGroup(channel, checksums, held, rows[list(which)], columns[list(which)])
+
+
+def check_edge(link: Channel) -> None:
+    """Refuse a link that delays, changes or quantizes a message, and losses that the receiver does not know of."""
+    instance("link between neighbours", first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
+    for item in unstack(link) if isinstance(link, OverTime) else [link]:
+        for part in item.maps if isinstance(item, Modes) else [item]:
+            while isinstance(part, Erasure):
+                part = part.base
+            if part.remembers or part.past or not _is_perfect(part):
+                expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
+                raise fail("link between neighbours", expected, type(first(link)).__name__)
+
+
+def arrival_chance(channel: Channel | None) -> float | None:
+    """Probability that a message arrives; None where it is not the same at every step whatever was before."""
+    chance = 1.0
+    while isinstance(channel, Erasure):
+        chance *= float(channel.arrival)
+        channel = channel.base
+    steady = channel is None or not (isinstance(channel, OverTime) or channel.erases)
+    return chance if steady else None
+
+
+def _is_perfect(channel: AbstractRandomAffine) -> bool:
+    """Test whether a channel delivers what is sent."""
+    if channel.inputs != channel.outputs:
+        return False
+    moments = second_order(arrived(channel))
+    same = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
+    return same and not np.any(moments.nominal.center)

@@ -1,0 +1,366 @@
+"""Fusion between neighbours inside a step: every node fuses what arrived, predicts once, and corrects."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
+from heliograph.fusion.intersection import inverse
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights
+from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.rules import AbstractFusion
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.numerics.check import fail
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.module import Module
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
+from heliograph.numerics.types import Array, Bool, Float, PyTree
+from heliograph.simulation.centres.centre import ObservationModel, observation_model
+from heliograph.simulation.centres.edges import Edges, edges_of
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+DENSE = 200  # nodes whose joint covariance is propagated at every step
+Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
+
+
+class MeshState(NamedTuple):
+    """Estimates of all nodes, the covariances by which they weigh, and what is known before any data.
+
+    Shapes: mean (node, n), covariance (node, n, n); joint (node, n, node, n) covariance of all errors, None where the
+    rule does without; plant: mean (n,) and covariance (n, n) of the state.
+    """
+
+    mean: Float[jax.Array, "node n"]
+    covariance: Float[jax.Array, "node n n"]
+    joint: Float[jax.Array, "node n node n"] | None
+    plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+
+
+class Data(NamedTuple):
+    """Measurement models of one step: H_j' R_j^-1 (node, n, m) and S_j = H_j' R_j^-1 H_j (node, n, n) of what is there.
+
+    `complete`: S_j if no component were missing.
+    """
+
+    observation: Observation
+    weighted: Float[jax.Array, "node n m"]
+    information: Float[jax.Array, "node n n"]
+    complete: Float[jax.Array, "node n n"]
+
+
+class Parts(NamedTuple):
+    """One step of all nodes without the estimates, which enter none of it.
+
+    exchanges: weights of every round but the last. Shapes: information (node, n, n) that each node has
+    learned; plant: moments of the state after the step.
+    """
+
+    motion: Motion
+    plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+    exchanges: tuple[Weights, ...]
+    data: Data
+    information: Float[jax.Array, "node n n"]
+    gains: Gains
+
+
+class Rows(Module):
+    """Some nodes of a mesh, of about as many neighbours, and the rule placed on them."""
+
+    rule: AbstractFusion
+    rows: np.ndarray
+    width: int = eqx.field(static=True)
+
+
+class Mesh(Module):
+    """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
+
+    `groups`: models of the measurements of the network's groups of nodes, None for nodes without a sensor; `order`
+    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again,
+    `ranks` the nodes of all buckets.
+    """
+
+    plant: AnyPlant
+    buckets: tuple[Rows, ...]
+    ranks: np.ndarray
+    edges: Edges
+    groups: tuple[ObservationModel | None, ...]
+    senders: np.ndarray
+    order: np.ndarray
+    counts: tuple[int, ...] = eqx.field(static=True)
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    nodes: tuple[str, ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    needs_joint: bool = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    def init(self) -> MeshState:
+        """Return the state before the first step: the plant's mean and covariance at every node."""
+        plant = at(self.plant, 0)
+        mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
+        nodes, n = len(self.senders), len(mean)
+        joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
+        return MeshState(jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1)), joint, (mean, covariance))
+
+    def step(
+        self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
+        u: jax.Array, k: jax.Array,
+    ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
+        """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes."""
+        blocks = self.blocks(state.joint)
+        there = jnp.concatenate([self._rows(part) for part in z])[self.order]
+        parts = self.parts(state.covariance, blocks, state.plant, ~jnp.isnan(there), arrived, u, k)
+        gains, motion = parts.gains, parts.motion
+        # All rounds but the last only intersect.
+        mean = state.mean
+        for weights in parts.exchanges:
+            mean = mean + self._pulled(weights.front, weights.parts, mean)
+        # Innovations about one common prediction, so that no digits of the means themselves are lost.
+        predicted = mean @ motion.matrix.T + motion.shift
+        common = jnp.mean(predicted, axis=0)
+        observation = parts.data.observation
+        off = jnp.where(jnp.isnan(there), 0.0, there - observation.offset - observation.gain @ common)
+        sums = self._collected(jnp.einsum("inm,im->in", parts.data.weighted, off), arrived)
+        # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
+        innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
+        mean = (
+            predicted + self._pulled(gains.front, gains.parts, mean) + jnp.einsum("iab,ib->ia", gains.gain, innovation)
+        )
+        # Covariance of all errors where the rule needs it; it is then what is claimed.
+        joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
+        claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
+        after = MeshState(mean, gains.covariance, joint, parts.plant)
+        return after, self._by_group(mean, claimed)
+
+    def parts(
+        self,
+        covariance: Float[Array, "node n n"],
+        blocks: Float[Array, "node degree n degree n"] | None,
+        moments: tuple[Array, Array],
+        there: Bool[Array, "node m"],
+        arrived: Arrived,
+        u: Array,
+        k: Array,
+    ) -> Parts:
+        """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
+        covariance, there, arrived, u = (jnp.asarray(part) for part in (covariance, there, arrived, u))
+        held = None if blocks is None else jnp.asarray(blocks)
+        plant: LinearPlant = at(self.plant, jnp.asarray(k))
+        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+        motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
+        after = moved_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
+        exchanges = []
+        for number in range(self.edges.rounds - 1):
+            exchanges.append(self._exchange(covariance, arrived[:, number]))
+            covariance = exchanges[-1].covariance
+        # What each node learns of the measurements, and its gains.
+        data = self._data(self.observe(after, jnp.asarray(k)), there)
+        information = self._collected(data.information, arrived)
+        complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
+        gains = self.gains(covariance, held, arrived[:, -1], motion, information, complete)
+        return Parts(motion, after, tuple(exchanges), data, information, gains)
+
+    def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
+        """Measurements of a group, filled with NaN up to the longest."""
+        return jnp.pad(z, ((0, 0), (0, self.size - z.shape[1])), constant_values=jnp.nan)
+
+    def _pulled(
+        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n n"], mean: jax.Array
+    ) -> Float[jax.Array, "node n"]:
+        """front_i sum_j parts_ij (xhat_j - xhat_i)."""
+        off = jnp.einsum("idab,idb->ia", parts, mean[self.senders] - mean[:, None])
+        return jnp.einsum("iab,ib->ia", front, off)
+
+    def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
+        """Messages about what was measured, and about what would be if no component were missing."""
+        real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
+        gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
+        weighted, information = jax.vmap(_message)(gain, noise, real & there)
+        complete = jax.vmap(_message)(gain, noise, real)[1]
+        return Data(observation, weighted, information, complete)
+
+    def observe(self, moments: tuple[jax.Array, jax.Array], k: jax.Array) -> Observation:
+        """Measurement models of all nodes at step k, rows of zeros where a node has none."""
+        n = len(moments[0])
+        parts = []
+        for group, count in zip(self.groups, self.counts, strict=True):
+            shapes = (count, self.size, n), (count, self.size), (count, self.size, self.size)
+            none = Observation(*(jnp.zeros(shape) for shape in shapes))
+            parts.append(none if group is None else group.observe(*moments, k, self.size))
+        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+
+    def _exchange(self, covariance: jax.Array, present: jax.Array) -> Weights:
+        """Weights of an exchange that only intersects, with the covariances after it."""
+        result: Weights = self._over_nodes(lambda rule, item: rule.neighbour_weights(item), covariance, None, present)
+        return result
+
+    def blocks(self, joint: jax.Array | None) -> jax.Array | None:
+        """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+        if joint is None:
+            return None
+        rows, columns = self.senders[:, :, None], self.senders[:, None]
+        return jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
+
+    def _over_nodes(
+        self,
+        function: Callable[..., PyTree],
+        covariance: jax.Array,
+        blocks: jax.Array | None,
+        present: jax.Array,
+        *rest: jax.Array,
+    ) -> PyTree:
+        """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
+        information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
+        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), *[0] * (1 + len(rest))))
+        results = []
+        for part in self.buckets:
+            rows, width = part.rows, part.width
+            theirs = self.senders[rows, :width]
+            block = None if blocks is None else blocks[rows, :width, :, :width]
+            item = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
+            results.append(both(part.rule, item, *(leaf[rows] for leaf in rest)))
+        if len(results) == 1:
+            return results[0]
+        # Rows of one length again, in the order of the nodes.
+        padded = [r._replace(parts=_padded(r.parts, self.senders.shape[1])) for r in results]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
+
+    def _collected(self, values: jax.Array, arrived: Arrived) -> jax.Array:
+        """Sums of the nodes' messages that each node has after all rounds, each counted once."""
+        if self.edges.rounds == 1:
+            return self.sum_of(values, jnp.asarray(arrived[:, 0]))
+        return jnp.tensordot(self.known(arrived).astype(values.dtype), values, 1)
+
+    def known(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
+        """Test whose measurements each node has after all rounds."""
+        known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
+        for number in range(self.edges.rounds):
+            known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
+        return known
+
+    def sum_of(self, values: jax.Array, present: jax.Array) -> jax.Array:
+        """Sum over what arrived of values by node."""
+        result: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
+        return result
+
+    def gains(
+        self,
+        covariance: jax.Array,
+        blocks: jax.Array | None,
+        present: jax.Array,
+        motion: Motion,
+        information: jax.Array,
+        complete: jax.Array,
+    ) -> Gains:
+        """Gains of all nodes."""
+
+        def single(rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array) -> Gains:
+            return rule.neighbour_gains(item, Step(motion.matrix, motion.noise, arrived, every))
+
+        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete)
+        return result
+
+    def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
+        """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
+        gains, motion = parts.gains, parts.motion
+        nodes, n = len(self.senders), len(motion.shift)
+        m = self._spread(transitions(gains, motion))
+        k = self._spread(jnp.where(present[:, :, None, None], gains.gain[:, None], 0.0))
+        f = gains.innovation.reshape(nodes * n, n)
+        weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), parts.data.information).reshape(k.shape)
+        result = m @ joint.reshape(m.shape) @ m.T + f @ motion.noise @ f.T + weighted @ k.T
+        return symmetrize(result).reshape(nodes, n, nodes, n)
+
+    def _spread(self, blocks: Float[jax.Array, "node degree n n"]) -> Float[jax.Array, "N N"]:
+        """Matrix of all nodes with these blocks; padding adds nothing."""
+        nodes, _, n, _ = blocks.shape
+        held = jnp.where(jnp.asarray(self.edges.present)[:, :, None, None], blocks, 0.0)
+        rows = jnp.arange(nodes)[:, None]
+        empty = jnp.zeros((nodes, nodes, n, n))
+        return empty.at[rows, self.senders].add(held).swapaxes(1, 2).reshape(nodes * n, nodes * n)
+
+    def _by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
+        """Estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
+        return tuple(
+            Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
+        )
+
+
+def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n n"]:
+    """Fill rows with zeros up to the longest."""
+    return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), (0, 0), (0, 0)))
+
+
+def transitions(gains: Gains, motion: Motion) -> Float[jax.Array, "node degree n n"]:
+    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
+    others = (gains.front[:, None] @ gains.parts).at[:, 0].set(0.0)
+    return others.at[:, 0].set(gains.innovation @ motion.matrix - others.sum(axis=1))
+
+
+@runs_last
+def _message(
+    gain: jax.Array, noise: jax.Array, used: jax.Array
+) -> tuple[Float[jax.Array, "n m *#runs"], Float[jax.Array, "n n *#runs"]]:
+    """H' R^-1 and H' R^-1 H of the components that are used."""
+    there = used.astype(gain.dtype)
+    h = there[:, None] * gain
+    r = there[:, None] * noise * there[None] + diagonal(1 - there)
+    weighted = transpose(solve(r, h))
+    return weighted, times(weighted, h)
+
+
+def mesh_of(network: Network, name: str) -> Mesh:
+    """Build the fusion `name` between neighbours of a network."""
+    fusion = network.meshes[name]
+    assert fusion.neighbours is not None
+    nodes = network.mesh_nodes(name)
+    graph = graph_of(fusion.neighbours, nodes)
+    # Models of the measurements, group after group.
+    place = {node: i for i, node in enumerate(nodes)}
+    groups: list[ObservationModel | None] = []
+    order: dict[str, int] = {}
+    for names in network.groups:
+        sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
+        groups.append(observation_model([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
+        order |= {node: len(order) + i for i, node in enumerate(names)}
+    kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
+    mine = [tuple(place[node] for node in network.groups[kind.group]) for kind in kinds]
+    return Mesh(
+        plant=network.plant,
+        buckets=tuple(
+            Rows(fusion.rule.placed(part), part.senders[:, 0], part.senders.shape[1]) for part in graph.buckets()
+        ),
+        ranks=np.argsort(np.concatenate([part.senders[:, 0] for part in graph.buckets()])),
+        edges=edges_of(fusion, graph),
+        groups=tuple(groups),
+        senders=graph.senders,
+        order=np.array([order[node] for node in nodes]),
+        counts=tuple(len(names) for names in network.groups),
+        places=tuple(mine),
+        nodes=graph.nodes,
+        size=max(1, *(node.received for node in network.nodes.values())),
+        needs_joint=fusion.rule.needs_joint,
+        claim=network.claims()[nodes[0]][name],
+    )
+
+
+def meshes_of(network: Network) -> dict[str, Mesh]:
+    """Fusions between neighbours, by name, to be stepped.
+
+    Raises:
+        ValueError: too many nodes for a rule that follows the joint covariance of their errors.
+    """
+    for name, item in network.meshes.items():
+        nodes = len(network.mesh_nodes(name))
+        if item.rule.needs_joint and nodes > DENSE:
+            kind = type(item.rule).__name__
+            expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
+            raise fail(f"fusion {name!r} between neighbours by {kind}", expected, nodes)
+    return {name: mesh_of(network, name) for name in network.meshes}

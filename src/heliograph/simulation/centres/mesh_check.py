@@ -1,0 +1,216 @@
+"""Checks of a fusion between neighbours when its network is made, and its claim."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_flow
+
+from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
+from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, weakest
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor, refuse_angles
+from heliograph.numerics.check import fail
+from heliograph.random_affine.erasure import arrived
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.simulation.centres.centre import informed_claim
+from heliograph.simulation.centres.edges import arrival_chance, check_edge, edges_of
+from heliograph.simulation.node import Node
+
+if TYPE_CHECKING:
+    from heliograph.simulation.network import Network
+
+MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
+CUTS, UNIT = 200, 1e5  # nodes whose losses are judged, and the digits of a loss's logarithm
+RANK = 1e-9  # relative: singular values of a mode's observability below are zero
+
+
+def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
+    """Refuse a fusion between neighbours that does not fit its network, by the name of the node that does not.
+
+    Raises:
+        ValueError: unknown nodes, nodes with a sensor but without the filter, models that are not linear, relays or
+            nodes that share noise, rules or links that do not serve, a node that cannot know an unstable mode.
+    """
+    what = f"fusion {name!r} between neighbours"
+    neighbours = fusion.neighbours or {}
+    if unknown := sorted(set(neighbours) - set(network.nodes)):
+        raise fail(what, f"nodes of the network {list(network.nodes)[:5]}", f"unknown ones {unknown[:5]}")
+    if network.relays is not None or network.common is not None:
+        kind = "relays" if network.relays is not None else "nodes that share a channel: stack their measurements"
+        raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", kind)
+    if not isinstance(first(network.plant), LinearPlant):
+        raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
+    # Nodes have the filter or no sensor, and names of their own for the result.
+    for node in network.mesh_nodes(name):
+        item = network.nodes[node]
+        if isinstance(item, Node) and fusion.filter not in item.filters:
+            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(item.filters) or "none")
+        if name in item.filters:
+            raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
+    _check_rule(what, fusion, network)
+    for link in {id(item): item for item in _links(fusion)}.values():
+        check_edge(link)
+    graph = graph_of(neighbours, network.mesh_nodes(name))
+    edges_of(fusion, graph)
+    fusion.rule.placed(graph)
+    mesh_claim(name, fusion, network)
+    _check_seen(what, name, fusion, network)
+    _check_losses(what, fusion, network, graph)
+
+
+def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
+    """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
+
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or a sender decides by what it
+    measured.
+    """
+    parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
+             for node in network.mesh_nodes(name)
+             if isinstance(item := network.nodes[node], Node)}  # fmt: skip
+    known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
+    senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
+    if isinstance(fusion.rule, FrozenWeights) or any(item.trigger is not None for item in senders):
+        return "nominal"
+    return known if fusion.rule.needs_joint else weakest([known, "upper"])
+
+
+def _links(fusion: Fusion) -> list[Channel]:
+    """Channels of the edges as they were given."""
+    if fusion.link is None:
+        return []
+    return list(fusion.link.values()) if isinstance(fusion.link, dict) else [fusion.link]
+
+
+def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
+    """Refuse a rule without weights for neighbours, more than it can do, and a start that has no inverse."""
+    rule, kind = fusion.rule, type(fusion.rule)
+    if not rule.between_neighbours:
+        raise fail(what, "a rule such as CovarianceIntersection() or MatrixWeights()", kind.__name__)
+    if getattr(rule, "with_mean", False):
+        raise fail(f"{what} by {kind.__name__}", "with_mean=False", True)
+    if fusion.rounds > 1 and (rule.needs_joint or isinstance(rule, FrozenWeights)):
+        raise fail(f"{what} by {kind.__name__}", "one round (more need a rule that intersects)", fusion.rounds)
+    start = np.asarray(first(network.plant).initial_covariance)
+    scale = np.sqrt(np.diagonal(start))
+    singular = np.any(scale == 0) or np.linalg.eigvalsh(start / np.outer(scale, scale))[0] < RANK
+    if singular and not rule.needs_joint and not isinstance(rule, FrozenWeights):
+        raise fail(f"{what} by {kind.__name__}", "a regular initial covariance of the plant", "a singular one")
+
+
+def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> None:
+    """Refuse every node for which an unstable mode is seen by nobody upstream; warn of stable ones.
+
+    Mode lambda is seen where rank [lambda I - A; H of all upstream] = n, itself included.
+    """
+    nodes = network.mesh_nodes(name)
+    sensors = [network.nodes[node] for node in nodes]
+    parts = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
+    varying = [item for pair in parts for item in pair] + [network.plant]
+    if any(isinstance(item, OverTime) for item in varying):
+        return
+    a = np.asarray(first(network.plant).matrix)
+    n = len(a)
+    refuse_angles(what, network.plant, *(sensor for sensor, _ in parts))
+    # Squares H'H of each node's mean gain, and their sums over those upstream.
+    squares = np.zeros((len(nodes), n, n))
+    for i, item in enumerate(sensors):
+        if isinstance(item, Node):
+            h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(item.sensor))
+            squares[i] = h.T @ h
+            noise = np.asarray(first(item.sensor).noise.covariance)
+            _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
+    unseen: dict[bool, list[str]] = {True: [], False: []}
+    values = np.linalg.eigvals(a)
+    known: dict[int, set[bool]] = {}
+    for i, places in enumerate(upstream(graph_of(fusion.neighbours or {}, nodes))):
+        if id(places) not in known:
+            known[id(places)] = _unseen(a, values, squares[places].sum(axis=0))
+        for unstable in known[id(places)]:
+            unseen[unstable].append(nodes[i])
+    if unseen[True]:
+        some = ", ".join(map(repr, unseen[True][:5])) + (" and more" if len(unseen[True]) > 5 else "")
+        raise fail(
+            what, "that a node or one upstream of it observes every mode that does not decay", f"none for {some}"
+        )
+    if unseen[False]:
+        warnings.warn(f"{what}: a decaying mode is observed by nobody upstream of {unseen[False][:5]}; their errors "
+                      "are those of its prior", stacklevel=4)  # fmt: skip
+
+
+def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+    """Refuse a node whose error grows whatever the rule, since messages from those that see a mode are lost too often.
+
+    Of nodes that do not see the mode lambda, none may get a message with a probability p of |lambda|^2 p >= 1: p is the
+    product of the loss probabilities of all edges into them, over sets of nodes the largest, by a minimal cut.
+    """
+    link, names = fusion.link, graph.nodes
+    if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
+        return
+    chances = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
+               for j, i in graph.edges]  # fmt: skip
+    if any(chance is None for chance in chances):
+        return
+    # Capacities -log p in whole units; those that are never cut get more than all others together.
+    exact = np.array([-np.log(max(1 - float(c or 0.0), 1e-300)) for c in chances])
+    units = np.minimum(np.round(UNIT * exact), 1e8).astype(np.int32)
+    values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
+    for value, vector in zip(values, vectors.T, strict=True):
+        if abs(value) <= 1 + MODE:
+            continue
+        sees = np.array([_sees(network.nodes[name], vector) for name in names])
+        source = len(names)
+        rows = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
+        columns = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
+        data = np.concatenate([units, np.full(sees.sum(), 2**30, dtype=np.int32)]).astype(np.int32)
+        flow = csr_array((data, (rows, columns)), shape=(source + 1, source + 1))
+        for i in np.flatnonzero(~sees):
+            cut = maximum_flow(flow, source, int(i)).flow_value / UNIT
+            if cut <= 2 * np.log(abs(value)) * (1 - MODE):
+                raise fail(what, f"losses below {1 / abs(value) ** 2:.3g} in all of what node {names[i]!r} learns of a "
+                           f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip
+
+
+def _sees(item: object, vector: np.ndarray) -> bool:
+    """Test whether a node's own measurement shows a mode."""
+    if not isinstance(item, Node):
+        return False
+    h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(first(item.sensor)))
+    return bool(np.any(np.abs(h @ vector) > RANK))
+
+
+def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
+    """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
+    size = np.linalg.norm(a, 2) or 1.0
+    result = set()
+    for value in values:
+        both = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
+        if np.linalg.svd(both, compute_uv=False)[-1] < RANK:
+            result.add(bool(abs(value) >= 1 - MODE))
+    return result
+
+
+def _scaled(h: np.ndarray) -> np.ndarray:
+    """Rows of unit length, whatever the unit of a measurement."""
+    lengths = np.linalg.norm(h, axis=1, keepdims=True)
+    return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
+
+
+def _matrix(sensor: object) -> np.ndarray:
+    assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
+    return np.asarray(sensor.matrix)
+
+
+def _check_regular(where: str, noise: np.ndarray, item: Node) -> None:
+    """Refuse a measurement without noise in some direction: its information has no number."""
+    channel = second_order(arrived(first(item.channel)))
+    gain = np.asarray(channel.mean_gain)
+    total = gain @ noise @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
+    scale = np.sqrt(np.maximum(np.diagonal(total), 0.0))
+    if np.any(scale == 0) or np.linalg.eigvalsh(total / np.outer(scale, scale))[0] < RANK:
+        raise fail(where, "measurement noise in every direction", "a singular covariance")

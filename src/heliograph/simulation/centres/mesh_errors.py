@@ -1,0 +1,336 @@
+"""Errors of nodes that estimate from their neighbours, before any data: given what arrives, and in the mean over it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import bsr_array, csr_array
+
+from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
+from heliograph.simulation.arguments import inputs_of, key_of
+from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of, transitions
+from heliograph.simulation.network import Network
+
+SPARSE = 2000  # nodes whose joint covariance fits in memory
+
+
+@readable
+@dataclass(frozen=True)
+class MeshErrors:
+    """Covariances of the errors of all nodes of a fusion between neighbours, after each step.
+
+    Args:
+        nodes: names of the nodes.
+        actual: E[e_i e_i'] (time, node, n, n), given what arrives or in the mean over it.
+        claimed: what each node claims (time, node, n, n).
+        joint: Cov(e_i, e_j) after the last step (node, n, node, n).
+        claim: of `actual`: "exact", or "nominal" where arrivals were drawn.
+    """
+
+    nodes: tuple[str, ...]
+    actual: Float[np.ndarray, "time node n n"]
+    claimed: Float[np.ndarray, "time node n n"]
+    joint: Float[np.ndarray, "node n node n"]
+    claim: Claim
+
+    def mean_trace(self) -> Float[np.ndarray, " time"]:
+        """Mean over the nodes of tr E[e e'] at each step."""
+        return np.asarray(np.trace(self.actual, axis1=-2, axis2=-1).mean(axis=-1))
+
+
+def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Array) -> Bool[np.ndarray, "..."]:
+    """Draw what arrives between the neighbours of a fusion, as a run of this key does.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours.
+        horizon: number of steps.
+        key: a seed or a JAX key.
+
+    Returns:
+        Flags (horizon, node, rounds, degree): a node's own message first, then its neighbours'.
+
+    Raises:
+        ValueError: no such fusion, no horizon.
+    """
+    mesh = mesh_named(network, fusion)
+    steps = check_count("horizon", horizon)
+    with jax.enable_x64(True):
+        return np.asarray(_drawn(mesh, key_of(key), np.arange(steps)))
+
+
+@quickly_compiled
+def _drawn(mesh: Mesh, key: jax.Array, steps: np.ndarray) -> jax.Array:
+    def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
+        return mesh.edges.draw(state, key, k)
+
+    result: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
+    return result
+
+
+def mesh_errors(
+    network: Network,
+    fusion: str,
+    arrived: Bool[ArrayLike, "horizon node rounds degree"] | int,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
+) -> MeshErrors:
+    """Compute the covariances of all nodes' errors for one pattern of arrivals, whatever the rule.
+
+    J+ = M J M' + F Q F' + sum_l K_l R_l K_l' with the gains of these arrivals, by sparse M: up to 2,000 nodes. All
+    measurements reach their own node.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours.
+        arrived: what arrives (horizon, node, rounds, degree), such as `mesh_arrivals` draws; or a number of steps at
+            which everything does.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: no such fusion, more than 2,000 nodes, flags of another shape.
+
+    Source: Bar-Shalom, On the track-to-track correlation problem (1981), for all pairs of a graph.
+    """
+    mesh = mesh_named(network, fusion)
+    flags = _flags(mesh, arrived)
+    network.check_horizon(len(flags))
+    u = inputs_of(network, inputs, len(flags))
+    actual, claimed, last = [], [], np.zeros(())
+    for joint, error, claim in errors_over_time(mesh, flags, u):
+        actual.append(error)
+        claimed.append(claim)
+        last = joint
+    nodes, n = len(mesh.nodes), actual[0].shape[-1]
+    return MeshErrors(mesh.nodes, np.stack(actual), np.stack(claimed), last.reshape(nodes, n, nodes, n), "exact")
+
+
+def errors_over_time(
+    mesh: Mesh, flags: np.ndarray, u: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the joint covariance (N, N), its diagonal blocks and the nodes' claims (node, n, n) after each step."""
+    with jax.enable_x64(True):
+        start = to_numpy(mesh.init())
+    covariance, moments = start.covariance, start.plant
+    nodes, n = start.mean.shape
+    joint = np.tile(moments[1], (nodes, nodes))
+    follows = mesh.needs_joint
+    for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
+        blocks = blocks_of(joint, mesh.senders) if follows else None
+        with jax.enable_x64(True):
+            parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
+        joint = moved(mesh, joint, parts, arrived)
+        covariance, moments = parts.gains.covariance, parts.plant
+        error = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
+        yield joint, error, error if follows else covariance
+
+
+@quickly_compiled
+def _parts(
+    mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
+    u: np.ndarray, k: np.ndarray,
+) -> Parts:  # fmt: skip
+    there = np.ones((len(mesh.senders), mesh.size), dtype=bool)
+    return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
+
+
+def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> np.ndarray:
+    """Joint covariance (N, N) after a step."""
+    gains, motion = parts.gains, parts.motion
+    nodes, n = len(mesh.senders), len(motion.shift)
+    # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
+    for number, weights in enumerate(parts.exchanges):
+        held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
+        held[:, 0] = np.eye(n) - held[:, 1:].sum(axis=1)
+        joint = congruence(spread(mesh, held, mesh.edges.present), joint)
+    # M J M'.
+    with jax.enable_x64(True):
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, motion))))
+    result = congruence(spread(mesh, m, mesh.edges.present), joint)
+    # F Q F', and K_il R_l K_jl' = W_i S_l W_j' over the measurements that both have.
+    f = np.asarray(gains.innovation).reshape(nodes * n, n)
+    result += f @ motion.noise @ f.T
+    result += _noise(mesh, parts, arrived)
+    return np.asarray((result + result.T) / 2)
+
+
+def _noise(mesh: Mesh, parts: Parts, arrived: np.ndarray) -> np.ndarray:
+    """sum_l K_il R_l K_jl' of all pairs (N, N)."""
+    nodes = len(mesh.senders)
+    w, s = np.asarray(parts.gains.gain), np.asarray(parts.data.information)
+    n = w.shape[-1]
+    if mesh.edges.rounds == 1:
+        held = np.where(arrived[:, 0, :, None, None], w[:, None], 0.0)
+        left = spread(mesh, held @ s[mesh.senders], mesh.edges.present)
+        right = spread(mesh, held, mesh.edges.present)
+        return np.asarray((left @ right.T).todense())
+    known = np.asarray(mesh.known(arrived)).astype(float)
+    k = np.einsum("ij,iab->iajb", known, w)
+    both = np.einsum("iajb,jbc->iajc", k, s).reshape(nodes * n, nodes * n)
+    return np.asarray(both @ k.reshape(nodes * n, nodes * n).T)
+
+
+def spread(mesh: Mesh, blocks: np.ndarray, present: np.ndarray) -> Any:
+    """Sparse matrix (N, N) with these blocks (node, degree, n, n) at each node's neighbours."""
+    nodes, n = len(blocks), blocks.shape[-1]
+    ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    parts = np.ascontiguousarray(blocks[present]), mesh.senders[present], ends
+    return bsr_array(parts, shape=(nodes * n, nodes * n), blocksize=(n, n))
+
+
+def congruence(m: Any, joint: np.ndarray) -> np.ndarray:
+    """M J M' of a sparse M and a symmetric J."""
+    return np.asarray(m @ np.ascontiguousarray((m @ joint).T))
+
+
+def blocks_of(joint: np.ndarray, senders: np.ndarray) -> np.ndarray:
+    """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+    nodes = len(senders)
+    n = len(joint) // nodes
+    whole = joint.reshape(nodes, n, nodes, n)
+    return np.moveaxis(whole[senders[:, :, None], :, senders[:, None], :], 3, 2)
+
+
+def best_possible(
+    network: Network,
+    fusion: str,
+    arrived: Bool[ArrayLike, "horizon node rounds degree"] | int,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
+) -> Float[np.ndarray, "node n n"]:
+    """Bound below the covariance of every node's error after the last step, which no linear rule can beat.
+
+    z_j(k - a) can be at node i only if a message carried it there since; a Riccati recursion from the plant's initial
+    covariance uses all that can be there, oldest first. Where all is Gaussian no rule at all is better.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours.
+        arrived: as for `mesh_errors`.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: no such fusion, flags of another shape.
+    """
+    mesh = mesh_named(network, fusion)
+    flags = _flags(mesh, arrived)
+    u = inputs_of(network, inputs, len(flags))
+    with jax.enable_x64(True):
+        start = to_numpy(mesh.init())
+        steps: list[Parts] = []
+        moments = start.plant
+        for k, u_k in enumerate(u):
+            steps.append(to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k))))
+            moments = steps[-1].plant
+    # Whose measurement of each age can have come, from the last step back.
+    count = len(mesh.nodes)
+    known: Any = csr_array(np.eye(count, dtype=np.int32))
+    information: list[np.ndarray] = []
+    for k in reversed(range(len(u))):
+        for number in reversed(range(mesh.edges.rounds)):
+            known = _reached(known, mesh, flags[k, :, number])
+        s = np.asarray(steps[k].data.information)
+        information.append((known @ s.reshape(count, -1)).reshape(s.shape))
+    # Riccati recursions of all nodes side by side, oldest measurement first.
+    result = np.array(start.covariance)
+    for model, total in zip(steps, reversed(information), strict=True):
+        a = np.asarray(model.motion.matrix)
+        predicted = a @ result @ a.T + model.motion.noise
+        result = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
+        result = (result + result.swapaxes(1, 2)) / 2
+    return result
+
+
+@quickly_compiled
+def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> Parts:
+    """Parts of a step at which everything arrives, for the models of plant and measurements in it."""
+    lossless = mesh.edges.lossless()
+    there = np.ones((len(mesh.senders), mesh.size), dtype=bool)
+    blocks = None
+    if mesh.needs_joint:
+        degree, n = mesh.senders.shape[1], covariance.shape[-1]
+        blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
+    return mesh.parts(covariance, blocks, moments, there, lossless, u, k)
+
+
+def _reached(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
+    """Matrix of what is known through one exchange more, earlier: a one where some message carried it."""
+    receiver, column = np.nonzero(present)
+    ones = np.ones(len(receiver), dtype=np.int32)
+    step = csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
+    result = known @ step
+    result.data = np.minimum(result.data, 1)
+    return result
+
+
+def freeze(
+    network: Network,
+    fusion: str,
+    arrived: Bool[ArrayLike, "horizon node rounds degree"],
+    last: int = 50,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
+) -> Network:
+    """Return the network whose best weights between neighbours are those for the mean of drawn joint covariances.
+
+    The joint covariance is followed once along these arrivals; the means of each neighbourhood's block over the last
+    steps are frozen. The network then runs without it, on thousands of nodes; its claim is "nominal".
+
+    Args:
+        network: the network; its fusion may have more nodes than `Fusion` follows.
+        fusion: name of its fusion between neighbours by best weights.
+        arrived: what arrives (horizon, node, rounds, degree), such as `mesh_arrivals` draws.
+        last: number of last steps over which blocks are averaged, 50 by default.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: no such fusion, one by another rule, more steps to average than there are.
+    """
+    mesh = mesh_named(network, fusion)
+    item = network.meshes[fusion]
+    if not item.rule.needs_joint:
+        raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(item.rule).__name__)
+    flags = _flags(mesh, arrived)
+    if check_count("last", last) > len(flags):
+        raise fail("last", f"at most the {len(flags)} steps", last)
+    u = inputs_of(network, inputs, len(flags))
+    total: np.ndarray | None = None
+    for k, (joint, _, _) in enumerate(errors_over_time(mesh, flags, u)):
+        # Blocks before a step are what its weights are made from.
+        if k >= len(flags) - last:
+            blocks = blocks_of(joint, mesh.senders)
+            total = blocks if total is None else total + blocks
+    assert total is not None
+    frozen = Fusion(item.filter, FrozenWeights(item.rule, total / last), neighbours=item.neighbours, link=item.link)
+    return Network(network.plant, network.nodes, {**network.fused, **network.meshes, fusion: frozen})
+
+
+def mesh_named(network: Network, fusion: str) -> Mesh:
+    """Build the named fusion between neighbours, of few enough nodes."""
+    instance("network", network, Network, "a Network")
+    if not isinstance(fusion, str) or fusion not in network.meshes:
+        raise fail("fusion", f"one between neighbours, of {list(network.meshes)}", repr(fusion))
+    if len(network.mesh_nodes(fusion)) > SPARSE:
+        raise fail(f"fusion {fusion!r}", f"at most {SPARSE} nodes, for the covariance of all their errors",
+                   len(network.mesh_nodes(fusion)))  # fmt: skip
+    return mesh_of(network, fusion)
+
+
+def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
+    """Flags of each step, all of them where a number of steps is given."""
+    shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])
+    if isinstance(arrived, int | np.integer) and not isinstance(arrived, bool):
+        return np.repeat(mesh.edges.lossless()[None], check_count("number of steps", arrived), axis=0)
+    flags = np.asarray(arrived)
+    if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
+        raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
+                   f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
+    result: np.ndarray = flags & mesh.edges.present[:, None]
+    return result

@@ -1,0 +1,166 @@
+"""Errors of nodes that estimate from their neighbours, in the mean over independent losses, before any data.
+
+Where a node's gains depend on what arrives at this step alone, J is independent of them, and losses of different
+receivers of each other. For i != j
+
+  J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'
+
+and the diagonal blocks are means over all patterns of what may arrive at one node.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.mesh.gains import Gains
+from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.model.channel import Channel
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.arguments import inputs_of
+from heliograph.simulation.centres.edges import arrival_chance
+from heliograph.simulation.centres.mesh import Mesh, Parts, Rows, transitions
+from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
+from heliograph.simulation.network import Network
+
+NODES, DEGREE = 200, 10  # of which patterns are listed
+
+
+class Patterns(NamedTuple):
+    """All patterns of what may arrive at each node, one row each, node after node, with their probabilities.
+
+    Shapes: node (row,), present (row, degree), probability (row,); start (node,): a node's first row.
+    """
+
+    node: np.ndarray
+    present: np.ndarray
+    probability: np.ndarray
+    start: np.ndarray
+
+
+def mean_mesh_errors(
+    network: Network, fusion: str, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
+) -> MeshErrors:
+    """Compute the covariances of all nodes' errors in the mean over losses, for weights made from this mean.
+
+    A node then needs nothing but what arrives at this step: best weights are solved for it, from the mean joint
+    covariance of its neighbourhood. Up to 200 nodes of at most 10 neighbours, losses independent over steps and edges.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours, by best weights or diffusion.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: no such fusion, a rule whose gains remember losses (intersection), losses in bursts, too many
+            neighbours.
+    """
+    mesh = mesh_named(network, fusion)
+    item = network.meshes[fusion]
+    if not (item.rule.needs_joint or isinstance(item.rule, FrozenWeights)):
+        expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
+        raise fail(f"mean errors of fusion {fusion!r}", expected, type(item.rule).__name__)
+    network.check_horizon(check_count("horizon", horizon))
+    u = inputs_of(network, inputs, horizon)
+    names = mesh.nodes
+    chances = [_known(item.link, f"{sender} to {names[i]}")
+               for i in range(len(names)) for sender in (item.neighbours or {})[names[i]]]  # fmt: skip
+    patterns = _patterns(mesh, np.array(chances))
+    # A row of the mesh for each pattern of each node.
+    rule = item.rule.placed(graph_of(item.neighbours or {}, names))
+    rule = jax.tree.map(lambda leaf: leaf[patterns.node] if eqx.is_array(leaf) else leaf, rule)
+    part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
+    with jax.enable_x64(True):
+        start = to_numpy(mesh.init())
+    joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
+    errors = []
+    for k, u_k in enumerate(u):
+        with jax.enable_x64(True):
+            step = to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k)))
+            blocks = blocks_of(joint, mesh.senders)
+            gains = to_numpy(_gains(rows, covariance, blocks, patterns, step))
+        joint, moments = _mean(mesh, joint, blocks, patterns, gains, step), step.plant
+        n = len(step.motion.shift)
+        errors.append(np.einsum("iaib->iab", joint.reshape(len(names), n, len(names), n)).copy())
+        covariance = np.asarray(gains.covariance)[patterns.start]
+    return MeshErrors(names, np.stack(errors), np.stack(errors), joint.reshape(len(names), n, len(names), n), "exact")
+
+
+@quickly_compiled
+def _gains(rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: Patterns, step: Parts) -> Gains:
+    information = rows.sum_of(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
+    complete = jnp.asarray(step.information)[patterns.node]
+    held = jnp.asarray(blocks)[patterns.node]
+    return rows.gains(jnp.asarray(covariance), held, jnp.asarray(patterns.present), step.motion,
+                      information, complete)  # fmt: skip
+
+
+def _mean(
+    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: Patterns, gains: Gains, step: Parts
+) -> np.ndarray:
+    """Joint covariance (N, N) after a step."""
+    count, degree = mesh.senders.shape
+    q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        weighted = values * patterns.probability.reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
+
+    # Gains of every pattern, M_i with the node itself first.
+    with jax.enable_x64(True):
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion))))
+    f, w = np.asarray(gains.innovation), np.where(patterns.present[:, :, None, None], gains.gain[:, None], 0.0)
+    # Different receivers: products of means.
+    result = congruence(spread(mesh, mean(m), mesh.edges.present), joint)
+    f_mean = mean(f).reshape(count * n, n)
+    result += f_mean @ q @ f_mean.T
+    held = mean(w)
+    left = spread(mesh, held @ s[mesh.senders], mesh.edges.present)
+    result += (left @ spread(mesh, held, mesh.edges.present).T).toarray()
+    # One receiver: the mean over its patterns.
+    flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
+    inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
+    noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
+    same = mean(flat @ inside @ flat.swapaxes(1, 2) + f @ q @ f.swapaxes(1, 2) + noise)
+    whole = result.reshape(count, n, count, n)
+    items = np.arange(count)
+    whole[items, :, items, :] = same
+    return np.asarray((result + result.T) / 2)
+
+
+def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
+    """List the patterns of every node; `chances` of arrival of all edges, receiver after receiver."""
+    counts = mesh.edges.present[:, 1:].sum(axis=1)
+    if len(counts) > NODES or counts.max() > DEGREE:
+        raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
+                   f"{len(counts)} nodes of up to {counts.max()}")  # fmt: skip
+    rows: list[int] = []
+    present: list[list[bool]] = []
+    probability: list[float] = []
+    start: list[int] = []
+    for i, mine in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
+        start.append(len(rows))
+        for flags in product(*[[True] if p == 1 else [True, False] for p in mine]):
+            rows.append(i)
+            present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
+            probability.append(float(np.prod(np.where(flags, mine, 1 - mine))))
+    return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
+
+
+def _known(link: Channel | dict[str, Channel] | None, edge: str) -> float:
+    """Probability that a message of this edge arrives, at every step the same and drawn anew."""
+    channel = link[edge] if isinstance(link, dict) else link
+    chance = arrival_chance(channel)
+    if chance is None:
+        expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
+        raise fail(f"mean errors: link {edge!r}", expected, type(channel).__name__)
+    return chance

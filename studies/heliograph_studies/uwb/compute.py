@@ -1,0 +1,130 @@
+"""What every rule makes of every drive, each with numbers that the other drives taught."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from heliograph.filters.innovation_summary import InnovationSummary, outlying, summarise_innovations
+from heliograph.model.estimate import Innovation
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
+from heliograph_studies.uwb.drives import Drive, drives
+from heliograph_studies.uwb.learning import followed, learn, slots
+from heliograph_studies.uwb.radio import Loss, Power, losses, power
+from heliograph_studies.uwb.setting import BEST, STARTS, Numbers, Setting
+
+
+@dataclass(frozen=True)
+class Published:
+    """Published RMS errors in the plane, m: least squares, and an error-state filter with inertial data; None: none."""
+
+    ls: float | None
+    eskf: float | None
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule on one drive within the published window.
+
+    rmse: of the place in the plane at the time that the range is of, m. nees: per dimension; 1 where the claim is
+    right. at_stamp: RMSE of the place predicted to the stamp. numbers: what it was read with. The path, its covariance,
+    its innovations and weights are for figures.
+    """
+
+    rmse: float
+    nees: float
+    at_stamp: float
+    numbers: Numbers
+    time: Unlisted[np.ndarray]
+    place: Unlisted[np.ndarray]
+    deviation: Unlisted[np.ndarray]
+    error: Unlisted[np.ndarray]
+    weight: Unlisted[np.ndarray]
+    anchors: dict[str, InnovationSummary]
+    blamed: list[str]
+
+
+@dataclass(frozen=True)
+class OfDrive:
+    """One drive: rows, window (s), published errors, rules, losses and power, which drives taught, true path."""
+
+    rows: int
+    window: tuple[float, float]
+    published: Published
+    rules: dict[str, Rule]
+    losses: Loss
+    power: Power
+    learned_from: list[str]
+    truth: Unlisted[np.ndarray]
+    places: Unlisted[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The drives by name, and the mean NEES of each rule over them."""
+
+    drives: dict[str, OfDrive]
+    mean_nees: dict[str, float]
+
+
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Read the drives; learn each rule on all drives but one, and judge it on that one."""
+    found = stages("reading the drives", partial(drives, Path(setting.recording)))
+    results: dict[str, OfDrive] = {}
+    for i, drive in enumerate(found):
+        others = [other for other in found if other is not drive]
+        work = partial(of_drive, drive, others, setting.iterations)
+        results[drive.name] = stages("drives", work, done=i, total=len(found))
+    mean = {rule: float(np.mean([d.rules[rule].nees for d in results.values()])) for rule in STARTS}
+    return Outcome(results, mean)
+
+
+def of_drive(drive: Drive, others: Sequence[Drive], iterations: int) -> OfDrive:
+    """One drive, with numbers from the others alone."""
+    rules = {rule: judged(rule, drive, learn(rule, others, iterations)) for rule in STARTS}
+    learned_from = [other.name for other in others] if iterations else []
+    return OfDrive(
+        len(drive.time), drive.window, Published(*drive.published), rules, losses(drive), power(drive), learned_from,
+        drive.truth[:, :2], drive.places,
+    )  # fmt: skip
+
+
+_followed = jax.jit(followed, static_argnums=0)
+
+
+def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
+    """The rule's path against the reference, and what its innovations say of the anchors."""
+    read = slots(drive)
+    with jax.enable_x64(True):
+        result = _followed(rule, np.array(numbers), drive.places, drive.truth[0, :2], read.ranges, read.dt)
+    place, covariance, innovation, variance, weight = (np.asarray(value) for value in result)
+    used = (read.time >= drive.window[0]) & (read.time <= drive.window[1])
+
+    def off(time: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+        true = np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
+        return np.asarray((estimate - true)[used])
+
+    # The place that a range is of lies before its stamp; the place at the stamp is predicted.
+    error = off(read.time - numbers.late, place)
+    ahead = place + numbers.late * np.gradient(place, np.maximum.accumulate(read.time), axis=0)
+    squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[used]), error)
+    sizes = np.einsum("ti,ij->tij", variance, np.eye(variance.shape[1]))
+    summaries = summarise_innovations(Innovation(innovation, sizes, np.zeros(len(innovation)), weight))
+    return Rule(
+        _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],
+        np.sqrt(np.trace(covariance[used], axis1=1, axis2=2)), np.linalg.norm(error, axis=1), weight[used],
+        dict(zip(drive.names, summaries, strict=True)), [drive.names[i] for i in outlying(summaries)],
+    )  # fmt: skip
+
+
+def _rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def best_of(drive: OfDrive) -> Rule:
+    """The rule that the page is about."""
+    return drive.rules[BEST]

@@ -1,0 +1,95 @@
+"""What the example computes: errors before any data given what arrives, the bound, and simulated errors over claims."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+import heliograph as hg
+from heliograph.simulation import best_possible, mesh_arrivals, mesh_errors
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
+from heliograph_studies.without_centre.setting import PLANT, RULES, Setting, network, positions
+
+
+@dataclass(frozen=True)
+class Score:
+    """One rule: mean over nodes and the second half of the steps of the error's trace, over that of a centre.
+
+    claimed: the same of what the nodes claim. over_best: error over the least possible, at the last step. nees: the
+    smallest and largest of the nodes, simulated. over_time: the error at each step.
+    """
+
+    claim: str
+    error: float
+    claimed: float
+    over_best: float
+    nees: tuple[float, float]
+    over_time: Unlisted[np.ndarray]
+    nees_by_node: Unlisted[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Errors of the rules in units of a centre's that receives everything, and the graph."""
+
+    nodes: int
+    neighbours: float
+    centre: float
+    best_possible: float
+    rules: dict[str, Score]
+    positions: Unlisted[dict[str, np.ndarray]]
+    edges: Unlisted[dict[str, tuple[str, ...]]]
+    sensors: Unlisted[tuple[str, ...]]
+
+
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Everything."""
+    net, places = network(setting), positions(setting)
+    near = hg.fusion.neighbours_within(places, setting.radius)
+    scale = centre(net, setting.steps)
+    exact = stages("errors before any data", lambda: before_data(net, setting))
+    bound = stages("the bound", lambda: least(net, setting))
+    nees = stages("simulated runs", lambda: simulated(net, setting))
+    half, rules = slice(setting.steps // 2, None), {}
+    for name, (error, claimed) in exact.items():
+        means = float(error[half].mean() / scale), float(claimed[half].mean() / scale)
+        ends = min(nees[name].values()), max(nees[name].values())
+        claim = net.claims()["n0"][name]
+        rules[name] = Score(claim, *means, float(error[-1] / bound), ends, error / scale, nees[name])
+    mean = float(np.mean([len(mine) for mine in near.values()]))
+    measuring = tuple(name for name, node in net.nodes.items() if isinstance(node, hg.Node))
+    return Outcome(setting.nodes, mean, scale, bound / scale, rules, places, near, measuring)
+
+
+def centre(net: hg.Network, steps: int) -> float:
+    """Trace of the error covariance of a filter that receives every measurement, after so many steps."""
+    sensors = [node.sensor for node in net.nodes.values() if isinstance(node, hg.Node)]
+    information = sum(s.matrix.T @ np.linalg.solve(s.noise.covariance, s.matrix) for s in sensors)
+    a, p = np.asarray(PLANT.matrix), np.asarray(PLANT.initial_covariance)
+    for _ in range(steps):
+        p = a @ p @ a.T + PLANT.noise.covariance
+        p = np.linalg.inv(np.linalg.inv(p) + information)
+    return float(np.trace(p))
+
+
+def before_data(net: hg.Network, setting: Setting) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Mean over the nodes of the trace of the error, and of what is claimed, at each step, for drawn arrivals."""
+    result = {}
+    for name in RULES:
+        errors = mesh_errors(net, name, mesh_arrivals(net, name, setting.steps, setting.seed))
+        result[name] = errors.mean_trace(), np.trace(errors.claimed, axis1=-2, axis2=-1).mean(axis=-1)
+    return result
+
+
+def least(net: hg.Network, setting: Setting) -> float:
+    """Mean over the nodes of the trace of the least error possible, for the same arrivals."""
+    name = next(iter(RULES))
+    bound = best_possible(net, name, mesh_arrivals(net, name, setting.steps, setting.seed))
+    return float(np.trace(bound, axis1=1, axis2=2).mean())
+
+
+def simulated(net: hg.Network, setting: Setting) -> Mapping[str, dict[str, float]]:
+    """NEES per state of each rule and node, over all runs and steps."""
+    statistics = hg.monte_carlo(net, setting.steps, setting.runs, setting.seed, hg.Statistics())
+    return {rule: {name: statistics[name][rule].nees_per_dimension()[0] for name in net.names} for rule in RULES}

@@ -1,0 +1,171 @@
+"""Messages of bags and of CSV files as events: times of measuring and logging, rows, and what ends a reading early."""
+
+import re
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.files.network_file import load_module
+from heliograph.live.recorded import play
+from tests.files import bags
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """The network's file, its content, a drive, and its bag."""
+    folder = tmp_path_factory.mktemp("bags")
+    (folder / "net.py").write_text(bags.NETWORK)
+    network, module = load_module(str(folder / "net.py"))
+    drive = bags.Drive()
+    return network, module["sources"], drive, bags.write(folder / "drive", drive.messages())
+
+
+def test_header_and_log_times_are_both_there(world):
+    network, sources, drive, path = world
+    table = hg.files.read_messages(path, network, sources)
+    events = list(table.in_order())
+    gps = [event for event in events if event.node == "gps"]
+    order = np.argsort(drive.logged, kind="stable")
+    assert len(table) == len(events) == 220 and table.date == np.datetime64(bags.START, "ns")
+    np.testing.assert_array_equal([e.time for e in gps], (drive.measured[order] - bags.START) / 1e9)
+    np.testing.assert_array_equal([e.arrival for e in gps], (drive.logged[order] - bags.START) / 1e9)
+    np.testing.assert_array_equal([e.values[0] for e in gps], drive.position[order])
+    np.testing.assert_array_equal(table.lateness()["gps"], (drive.logged - drive.measured) / 1e9)
+    arrivals = [event.arrival for event in events]
+    assert arrivals == sorted(arrivals) and "/picture (20)" in table.notes[0]
+
+
+def test_rows_are_what_a_timeline_puts_in_order(world):
+    """With a window that nothing misses, the final estimates are those of the rows in the order of measuring."""
+    network, sources, _, path = world
+    table = hg.files.read_messages(path, network, sources)
+    final = play(network, table.in_order(), 10.0).final
+    rows = hg.run(network, *table.recording())
+    estimate, other = final.estimates["gps"]["filter"], rows.estimates["gps"]["filter"]
+    measured = ~np.isnan(table.recording().measurements["gps"][:, 0])
+    np.testing.assert_array_equal(final.time, rows.time[measured])
+    # Compiled apart: rounding only.
+    np.testing.assert_allclose(estimate.mean, other.mean[measured], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(estimate.covariance, other.covariance[measured], rtol=1e-9, atol=1e-12)
+
+
+def test_the_estimate_is_near_the_truth(world):
+    """A tenth of a second apart, deviation 0.2: the error's deviation is below that of a single position."""
+    network, sources, drive, path = world
+    record = hg.run(network, *hg.files.read_messages(path, network, sources).recording())
+    measured = ~np.isnan(hg.files.read_messages(path, network, sources).recording().measurements["gps"][:, 0])
+    error = np.asarray(record.estimates["gps"]["filter"].mean)[measured, 0] - drive.truth
+    assert np.sqrt(np.mean(error**2)) < 0.15
+
+
+def test_a_changed_type_ends_the_reading_and_what_was_read_stays(world, tmp_path):
+    network, sources, drive, _ = world
+    messages = drive.messages()
+    later = [(m[0], m[1], bags.ACCEL, bags.acceleration(1.0)) if m[1] == "/odometry" else m for m in messages[150:]]
+    changed = dict(sources) | {"/odometry": hg.files.json_field("linear.x", "gps")}
+    path = bags.write(tmp_path / "bag", messages[:150] + later)
+    with pytest.raises(ValueError, match=r"/odometry: expected a field 'linear.x' in nav_msgs/msg/Odometry, got only"):
+        hg.files.read_messages(path, network, changed)
+    both = dict(sources) | {"/odometry": hg.files.json_field("pose.pose.position.x", "gps")}
+    with pytest.raises(ValueError, match=r"expected a field 'pose.pose.position.x' in geometry_msgs/msg/Accel"):
+        hg.files.read_messages(path, network, both)
+    # A type with the same field: the first message of another type ends it.
+    twist = bags.STORE.types["geometry_msgs/msg/Twist"]
+    vector = bags.STORE.types["geometry_msgs/msg/Vector3"](1.0, 0.0, 0.0)
+    later = [
+        (m[0], m[1], "geometry_msgs/msg/Twist", twist(vector, vector)) if m[1] == "/acceleration" else m
+        for m in messages[150:]
+    ]
+    table = hg.files.read_messages(bags.write(tmp_path / "two", messages[:150] + later), network, sources)
+    expected = (
+        r"/acceleration, logged at .*: expected messages of geometry_msgs/msg/Accel, as before, got geometry_msgs"
+    )
+    assert len(table) > 100 and re.search(expected, table.broken)
+
+
+def test_a_bag_that_is_damaged(world, tmp_path):
+    network, sources, drive, _ = world
+    (tmp_path / "no.mcap").write_bytes(b"x" * 100)
+    with pytest.raises(ValueError, match=r"no.mcap: expected a bag that can be opened, got AnyReaderError"):
+        hg.files.read_messages(tmp_path / "no.mcap", network, sources)
+    with pytest.raises(ValueError, match=r"none.mcap: expected a bag, got nothing of that name"):
+        hg.files.read_messages(tmp_path / "none.mcap", network, sources)
+    # A header without a time, in the middle.
+    messages = drive.messages()
+    place = next(i for i in range(100, 200) if messages[i][1] == "/odometry")
+    messages[place] = (*messages[place][:3], bags.odometry(0, 1.0))
+    table = hg.files.read_messages(bags.write(tmp_path / "bag", messages), network, sources)
+    assert "field 'header.stamp': expected a time that was set" in table.broken and 50 < len(table) < 150
+    assert table.broken.endswith("what was read before it stays")
+
+
+@pytest.mark.slow
+def test_a_bag_that_was_cut_off_is_read_up_to_there(world, tmp_path):
+    """A chunk is 1 MiB: of two and a half the first two are whole, and their events are those of the whole bag."""
+    network, sources, *_ = world
+    whole = bags.write(tmp_path / "bag", bags.Drive(4000).messages())
+    data = whole.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: int(2.5 * 2**20)])
+    table, complete = (hg.files.read_messages(path, network, sources) for path in (cut, whole))
+    assert re.search(r"cut.mcap: expected a bag that ends, got one that was cut off after [0-9,]+ bytes", table.broken)
+    count = len(table)
+    assert 2000 < count < len(complete) and not complete.broken
+    for name, columns in table.columns.items():
+        n = len(columns.time)
+        assert columns.time == complete.columns[name].time[:n] and columns.values == complete.columns[name].values[:n]
+
+
+@pytest.mark.parametrize(
+    ("sources", "line"),
+    [
+        ({"/odom": hg.files.json_field("x", "gps")}, "expected a topic of the sources, /odom, got only /acceleration"),
+        (
+            {"/odometry": hg.files.json_field("pose.pose.position.X", "gps")},
+            "/odometry: expected a field 'pose.pose.position.X' in nav_msgs/msg/Odometry, got only header.stamp.sec",
+        ),
+        ({"/odometry": hg.files.json_field("pose.pose.position", "gps")}, "field 'pose.pose.position': expected a num"),
+    ],
+)
+def test_sources_that_do_not_fit_the_bag_are_one_line(world, sources, line):
+    network, *_, path = world
+    with pytest.raises(ValueError, match=line):
+        hg.files.read_messages(path, network, sources)
+
+
+def test_a_csv_file_is_mapped_by_the_same_object(world, tmp_path):
+    """Rows of a logger: a date, a position in millimetres; and a log of messages, with topic and payload."""
+    network, sources, *_ = world
+    place = hg.files.json_field("Position [mm]", "gps", scale=1e-3, time="Date")
+    (tmp_path / "log.csv").write_text(
+        "Date,Position [mm],Note\n2026-01-01T00:00:00Z,1500,start\n"
+        "2026-01-01T00:00:02Z,,\n2026-01-01T00:00:01Z,250.5,\n"
+    )
+    table = hg.files.read_messages(tmp_path / "log.csv", network, {"log.csv": place})
+    rows = table.recording()
+    np.testing.assert_array_equal(rows.time, [0.0, 1.0, 2.0])
+    np.testing.assert_allclose(rows.measurements["gps"][:, 0], [1.5, 0.2505, np.nan], rtol=1e-15)  # rounding
+    (tmp_path / "mqtt.csv").write_text(
+        'topic,arrival,payload\n/acceleration,2026-01-01T00:00:00Z,"{""linear"": {""x"": 2.0}}"\n'
+        '/else,2026-01-01T00:00:01Z,{}\n/acceleration,2026-01-01T00:00:02Z,"{""linear"": {}}"\n'
+    )
+    table = hg.files.read_messages(tmp_path / "mqtt.csv", network, sources)
+    (event,) = table.in_order()
+    assert event.node == "inputs" and event.values.tolist() == [2.0] and "/else (1)" in table.notes[0]
+    assert "row 3: expected a field 'linear.x', got no 'x' in an empty message" in table.broken
+
+
+def test_inputs_hold_and_repeated_events_count_once(world):
+    """Input 2 from second 1 on: the row at 1 has what held before it, the next has 2; time since the row before."""
+    network, *_ = world
+    table = hg.files.EventTable(network)
+    from heliograph.files.sources import Reading
+
+    second = 10**9
+    for node, time, value in (("gps", 3, 7.0), ("inputs", 1, 2.0), ("gps", 0, 5.0), ("gps", 3, 7.0)):
+        table.add(Reading("", node, None, bags.START + time * second, np.array([value])), bags.START + 4 * second)
+    rows = table.recording()
+    np.testing.assert_array_equal(rows.time, [0.0, 1.0, 3.0])
+    np.testing.assert_array_equal(rows.inputs, [[0.0, 0.0], [0.0, 1.0], [2.0, 2.0]])
+    np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [5.0, np.nan, 7.0])

@@ -1,0 +1,169 @@
+"""Fields of messages to outputs and inputs of a network: values, times, counts, and each error in one line."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.files.sources import Sources, at, matches, nanoseconds
+
+json_field = hg.files.json_field
+PLANT = hg.Plant(
+    lambda x, u: x + u[0] * u[1], [[0.1]], [0.0], [[1.0]], states=["temperature"], inputs=["heating", "dt"]
+)
+SENSOR = hg.Sensor(lambda x: x.repeat(2), np.eye(2), outputs=["in", "out"])
+LINK = hg.parallel([hg.perfect(), hg.perfect()])
+NETWORK = hg.Network(PLANT, {"garden": hg.Node(SENSOR, LINK, {"f": hg.cubature_filter(PLANT, SENSOR, LINK)})})
+STEPS = hg.LinearPlant([[1.0]], [[0.1]], [0.0], [[1.0]], states=["x"])
+COUNTING = hg.Network(STEPS, {"garden": hg.Node(hg.LinearSensor([[1.0]], 0.5), hg.perfect(), {})})
+
+
+def read(source, message, network=NETWORK):
+    (reading,) = Sources({"t": source}, network).read("t", message, "t")
+    return reading
+
+
+def test_a_field_becomes_its_output_in_its_unit():
+    """Fahrenheit to Celsius; the other output did not arrive, and neither time nor count is guessed."""
+    source = json_field("temp", node="garden", output="out", scale=5 / 9, offset=-160 / 9)
+    reading = read(source, json.loads('{"temp": 50, "battery": 98}'))
+    np.testing.assert_allclose(reading.values, [np.nan, 10.0], rtol=1e-14)  # rounding
+    assert reading[:4] == ("", "garden", None, None)
+
+
+def test_several_fields_are_one_measurement():
+    source = json_field(("a.0", "b"), "garden", scale=(1.0, 2.0), sequence="n", plant="device.id")
+    reading = read(source, {"a": [1, 7], "b": True, "n": 5, "device": {"id": "shed"}})
+    assert reading.values.tolist() == [1.0, 2.0] and reading.sequence == 5 and reading.plant == "shed"
+    assert read(json_field("", "inputs"), 3.5).values.tolist() == [3.5]
+
+
+@pytest.mark.parametrize("value", [None, np.nan, np.inf, "", np.float32("-inf")])
+def test_what_is_no_finite_number_did_not_arrive(value):
+    assert np.isnan(read(json_field("v", "garden", "in"), {"v": value}).values).all()
+
+
+def test_a_name_with_dots_comes_first():
+    message = {"a.b": 1, "a": {"b": 2, "c.d": 3}}
+    assert at(message, "a.b", "m") == 1 and at(message, "a.c.d", "m") == 3
+    assert at(SimpleNamespace(pose=SimpleNamespace(x=np.array([4.0]))), "pose.x.0", "m") == 4.0
+
+
+SECONDS = 1_700_000_000
+STAMP = SECONDS * 10**9 + 123_456_789
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "expected"),
+    [
+        ("2023-11-14T22:13:20.123456789Z", "s", STAMP),
+        ("2023-11-14T23:13:20.123456789+01:00", "s", STAMP),
+        (SimpleNamespace(sec=SECONDS, nanosec=123_456_789), "s", STAMP),
+        ({"secs": SECONDS, "nsecs": 123_456_789}, "s", STAMP),
+        (STAMP, "ns", STAMP),
+        (SECONDS * 1000, "ms", SECONDS * 10**9),
+        (SECONDS + 0.5, "s", SECONDS * 10**9 + 500_000_000),
+        (17, "step", 17),
+        (17.0, "step", 17),
+    ],
+)
+def test_times_keep_every_nanosecond(value, unit, expected):
+    assert nanoseconds(value, unit, "t") == expected
+
+
+@pytest.mark.parametrize(
+    "value", ["2023-11-14T22:13:20", "noon", True, None, np.nan, 0, SimpleNamespace(sec=0, nanosec=0), 1e300]
+)
+def test_what_is_no_time_is_refused(value):
+    with pytest.raises(ValueError, match=r"^t: expected "):
+        nanoseconds(value, "s", "t")
+
+
+@pytest.mark.parametrize(
+    ("topic", "pattern", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/b", "a/+", True),
+        ("a/b/c", "a/+", False),
+        ("a/b/c", "a/#", True),
+        ("a", "a/#", True),
+        ("b/a", "a/#", False),
+        ("a/b/up", "+/b/up", True),
+    ],
+)
+def test_wildcards_are_those_of_mqtt(topic, pattern, expected):
+    assert matches(topic, pattern) == expected
+
+
+def test_unknown_topics_are_counted_and_never_guessed():
+    sources = Sources({"house/+": json_field("t", "garden", "in")}, NETWORK)
+    assert sources.read("house/garden", {"t": 1}, "m") and not sources.read("home/garden", {"t": 1}, "m")
+    assert sources.read("home/garden", "no message", "m") == [] and dict(+sources.unknown) == {"home/garden": 2}
+
+
+def test_a_topic_feeds_several_nodes():
+    table = {"t": [json_field("a", "garden", "in"), json_field("h", "inputs", "heating")]}
+    readings = Sources(table, NETWORK).read("t", {"a": 1, "h": 2}, "m")
+    assert [reading.node for reading in readings] == ["garden", "inputs"]
+
+
+def test_steps_are_times_of_networks_that_count_steps():
+    assert read(json_field("v", "garden", time="k", time_unit="step"), {"v": 1, "k": 3}, COUNTING).time == 3
+    with pytest.raises(ValueError, match=r"'t', time: expected a time field in steps .* got 'k' in s"):
+        Sources({"t": json_field("v", "garden", time="k")}, COUNTING)
+    with pytest.raises(ValueError, match="expected a time that is no step"):
+        Sources({"t": json_field("v", "garden", "in", time="k", time_unit="step")}, NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("source", "message", "line"),
+    [
+        ({"path": "tmp"}, {"temp": 1, "b": 2}, "t: expected a field 'tmp', got no 'tmp' in temp, b"),
+        ({"path": "v.x"}, {"v": 1}, "t: expected a field 'v.x', got no 'x' in 1"),
+        ({"path": "v.2"}, {"v": [1, 2]}, "t: expected a field 'v.2', got no '2' in a list of 2"),
+        ({"path": "v"}, {"v": "hot"}, "t, field 'v': expected a number, true or false, or null .* got 'hot'"),
+        ({"path": "v"}, {"v": {"x": 1}}, "t, field 'v': expected a number, .* got {'x': 1}"),
+        ({"path": "v", "sequence": "n"}, {"v": 1, "n": -1}, "t, field 'n': expected a whole number .* got -1"),
+        ({"path": "v", "time": "at"}, {"v": 1, "at": "soon"}, "t, field 'at': expected a date .* got 'soon'"),
+        ({"path": "v", "plant": "id"}, {"v": 1, "id": 3}, "t, field 'id': expected a name, got 3"),
+    ],
+)
+def test_a_message_that_cannot_be_read_is_one_line(source, message, line):
+    with pytest.raises(ValueError, match=line):
+        read(json_field(node="garden", output="in", **source), message)
+
+
+@pytest.mark.parametrize(
+    ("table", "line"),
+    [
+        ([], r"sources: expected a dictionary of topics, .* got \[\]"),
+        ({3: json_field("v", "garden", "in")}, "sources: expected topics that are text, got 3"),
+        ({"t": "temp"}, "'t': expected json_field, or a list of them, got 'temp'"),
+        ({"t": json_field("v", "gardn", "in")}, r"'t', node: expected one of .* got 'gardn' \(closest: 'garden'\)"),
+        ({"t": json_field("v", "garden", "inn")}, r"'t', output: expected one of in, out, got 'inn' \(closest: 'in'\)"),
+        ({"t": json_field("v", "garden")}, "'t', path: expected 2 paths, for in, out, or output=, got 1"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_one_line(table, line):
+    with pytest.raises(ValueError, match=line):
+        Sources(table, NETWORK)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"path": ()},
+        {"path": 3},
+        {"path": "v", "output": ("a", "b")},
+        {"path": "v", "time_unit": "minutes"},
+        {"path": "v", "scale": np.nan},
+        {"path": ("v", "w"), "offset": (1.0, 2.0, 3.0)},
+        {"path": "v", "node": 3},
+        {"path": "v", "time": 3},
+    ],
+)
+def test_bad_input_is_one_line(arguments):
+    with pytest.raises(ValueError, match=r"^json_field, .*: expected"):
+        json_field(**({"node": "garden"} | arguments))

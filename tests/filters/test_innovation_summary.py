@@ -1,0 +1,43 @@
+"""Summaries of innovations: counts, intervals that cover, and the output to blame."""
+
+import numpy as np
+import pytest
+
+from heliograph.filters.innovation_summary import outlying, summarise_innovations
+from heliograph.model.estimate import Innovation
+
+
+def drawn(rng, steps, correlation=0.0, weight=None):
+    e = rng.standard_normal((steps, 2))
+    for k in range(1, steps):
+        e[k] = correlation * e[k - 1] + np.sqrt(1 - correlation**2) * e[k]
+    return Innovation(e, np.broadcast_to(np.eye(2), (steps, 2, 2)), np.zeros(steps), weight)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_the_interval_of_the_bias_covers_zero(correlation):
+    """Of 400 intervals of 95 % at least 93 % cover: three standard errors of the count below; correlated ones too."""
+    rng = np.random.default_rng(0)
+    found = [s for _ in range(200) for s in summarise_innovations(drawn(rng, 200, correlation))]
+    assert np.mean([s.bias_low <= 0 <= s.bias_high for s in found]) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 400)
+    # The mean square of 200 values has a deviation of sqrt(2 / 200), more where they are correlated; over 400 of them.
+    assert np.mean([s.squared for s in found]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_missing_values_are_no_values_and_the_line_says_what_was_found():
+    weight = np.ones((200, 2))
+    weight[:7, 0] = 0.1
+    innovation = drawn(np.random.default_rng(1), 200, weight=weight)
+    innovation.value[150:, 1] = np.nan
+    first, second = summarise_innovations(innovation)
+    assert (first.received, first.down_weighted, second.received) == (200, 7, 150)
+    assert str(first).startswith("7 of 200 down-weighted (1.7 % to 7 %), bias ")
+    assert second.share.low == 0.0 and outlying((first, second)) == [0]
+
+
+def test_an_output_that_never_arrived_is_said_to_be_silent():
+    innovation = drawn(np.random.default_rng(2), 5)
+    innovation.value[:, 1] = np.nan
+    _, second = summarise_innovations(innovation)
+    assert str(second) == "received 0 of 5"
+    assert outlying(summarise_innovations(innovation)) == []

@@ -1,0 +1,191 @@
+"""Topics that others make: zigbee2mqtt, The Things Network and mosquitto_pub, by the sources of a network's file."""
+
+import asyncio
+import json
+import queue
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nats")
+pytest.importorskip("paho")
+import nats
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+import heliograph as hg
+from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.transport import connected
+from heliograph.serving.message import Message
+from heliograph_studies.live.server import Server
+from tests.serving.broker_servers import at, running
+
+NETWORK = """
+import jax.numpy as jnp
+import heliograph as hg
+
+plant = hg.Plant(
+    lambda x, u: x, lambda u: 1e-4 * jnp.eye(1) * u[0], [20.0], [[25.0]], states=["temperature"], inputs=["dt"]
+)
+sensor = hg.Sensor(lambda x: x, noise=0.04, outputs=["temperature"])
+node = hg.Node(sensor, hg.perfect(), {"filter": hg.cubature_filter(plant, sensor, hg.perfect())})
+network = hg.Network(plant, {"garden": node})
+sources = {
+    "zigbee2mqtt/garden": hg.files.json_field("temperature", node="garden", output="temperature"),
+    "v3/farm@ttn/devices/+/up": hg.files.json_field(
+        "uplink_message.decoded_payload.temp_f", node="garden", scale=5 / 9, offset=-160 / 9,
+        time="received_at", sequence="uplink_message.f_cnt", plant="end_device_ids.device_id",
+    ),
+    "shed/temperature": hg.files.json_field("", node="garden"),
+}
+"""
+UPLINK = {
+    "end_device_ids": {"device_id": "field-7"},
+    "received_at": "2026-11-20T10:00:00.123456789Z",
+    "uplink_message": {"f_cnt": 42, "decoded_payload": {"temp_f": 50.0}},
+}
+NOW = datetime(2026, 11, 24, 19, 0, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    yield from running(tmp_path_factory.mktemp("server"))
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("network") / "net.py"
+    path.write_text(NETWORK)
+    return path
+
+
+@pytest.fixture
+def translator(file: Path) -> Translator:
+    from heliograph.files.network_file import load_module
+
+    network, module = load_module(str(file))
+    return Translator(module["sources"], network)
+
+
+def test_arrival_dates_what_has_no_time_and_counts_it(translator):
+    payload = b'{"temperature": 19.5, "battery": 100, "linkquality": 87}'
+    first, second = (translator.read("zigbee2mqtt/garden", payload, NOW + timedelta(seconds=k))[0] for k in range(2))
+    assert (first.node, first.sequence, first.time, first.values) == ("garden", 0, NOW, [19.5])
+    assert (second.sequence, second.time) == (1, NOW + timedelta(seconds=1))
+    assert translator.read("shed/temperature", b"21.5", NOW)[0].values == [21.5]
+
+
+def test_an_uplink_keeps_its_time_count_and_device(translator):
+    (message,) = translator.read("v3/farm@ttn/devices/field-7/up", json.dumps(UPLINK).encode(), NOW)
+    assert isinstance(message, Message) and (message.plant, message.sequence) == ("field-7", 42)
+    assert message.time == datetime(2026, 11, 20, 10, 0, 0, 123456, UTC)
+    assert message.values == pytest.approx([10.0], rel=1e-14)  # rounding
+
+
+def test_stored_and_unknown_messages_are_counted(translator):
+    assert translator.read("zigbee2mqtt/garden", b'{"temperature": 1}', NOW, stored=True) == []
+    assert len(translator.read("v3/farm@ttn/devices/a/up", json.dumps(UPLINK).encode(), NOW, stored=True)) == 1
+    assert translator.read("zigbee2mqtt/attic", b'{"temperature": 1}', NOW) == []
+    assert translator.left_out() == [
+        "topics that are not among the sources: zigbee2mqtt/attic (1)",
+        "1 stored messages were left out: without time= they have no date",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("payload", "line"),
+    [
+        (b"\xff", "zigbee2mqtt/garden: expected JSON, got b'\\xff'"),
+        (b"{}", "zigbee2mqtt/garden: expected a field 'temperature', got no 'temperature' in an empty message"),
+        (b'{"temperature": "warm"}', "zigbee2mqtt/garden, field 'temperature': expected a number"),
+        (b"[" * 100_000, "zigbee2mqtt/garden: expected JSON"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(translator, payload, line):
+    (said,) = translator.read("zigbee2mqtt/garden", payload, NOW)
+    assert isinstance(said, str) and said.startswith(line) and "\n" not in said
+
+
+def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
+    (message,) = translator.line(b'{"topic": "shed/temperature", "payload": "21.5", "retain": 0}')
+    (other,) = translator.line(b'{"topic": "zigbee2mqtt/garden", "payload": {"temperature": 3}}')
+    assert message.values == [21.5] and other.values == [3.0]
+    assert translator.line(b'{"node": "garden"}') == [b'{"node": "garden"}'] and translator.line(b"x") == [b"x"]
+
+
+def test_sources_and_parts_exclude_each_other():
+    from heliograph.serving.brokers.url import address
+    from heliograph.serving.fleet import Options
+    from heliograph.serving.running import ServiceSettings
+
+    plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
+    with pytest.raises(ValueError, match="--parts: expected messages in our own form"):
+        ServiceSettings(network, Options(1.0), "s.db", broker=address("nats://a", {}), parts=2, sources={"t": "f"})
+
+
+@pytest.mark.real("NATS")
+def test_subjects_of_nats_are_the_same_sources(server, translator):
+    async def work() -> None:
+        where = at(server, "nats", "field")
+        transport = connected(where, translator=translator)
+        try:
+            await asyncio.wait_for(transport._reading(), 20)
+            client = await nats.connect(f"nats://{where.host}:{where.port}")
+            await client.publish("zigbee2mqtt.garden", b'{"temperature": 18.0}')
+            await client.publish("v3.farm@ttn.devices.field-7.up", json.dumps(UPLINK).encode())
+            await client.publish("field.in.a", b"as it is")
+            await client.close()
+            payloads: list[object] = []
+            while len(payloads) < 3:
+                batch = await asyncio.wait_for(transport.receive(), 20)
+                payloads += batch.payloads
+                await batch.acknowledge()
+        finally:
+            await transport.close()
+        assert payloads[0].values == [18.0] and payloads[1].plant == "field-7" and payloads[2] == b"as it is"
+
+    asyncio.run(work())
+
+
+@pytest.mark.real("MQTT")
+def test_the_service_takes_a_topic_of_zigbee2mqtt_without_glue(server, file, tmp_path):
+    """The command itself, a real broker, and a payload as zigbee2mqtt sends it: an estimate comes out."""
+    where, bodies = at(server, "mqtt", "home"), queue.Queue()
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.on_message = lambda client, data, message: bodies.put((message.topic, message.payload))
+    client.connect(where.host, where.port)
+    client.loop_start()
+    client.subscribe("home/out/#", 1)
+    command = [sys.executable, "-m", "heliograph", "serve", str(file), "--store", "none", "--broker", str(where)]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    payload = json.dumps({"battery": 98, "linkquality": 120, "temperature": 17.25})
+    try:
+        # Until the service listens, what is sent is lost, as of any sensor.
+        for _ in range(120):
+            client.publish("zigbee2mqtt/garden", payload, 0)
+            try:
+                topic, body = bodies.get(timeout=1.0)
+                break
+            except queue.Empty:
+                continue
+        client.publish("zigbee2mqtt/garden", b'{"temperature": "warm"}', 0)
+        refused = None
+        for _ in range(60):
+            name, content = bodies.get(timeout=20)
+            if name.startswith("home/out/refused"):
+                refused = json.loads(content)
+                break
+    finally:
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+        client.disconnect()
+        client.loop_stop()
+    estimate = json.loads(body)["estimates"]["garden"]["filter"]
+    assert topic == "home/out/provisional/_" and estimate["mean"] == pytest.approx([17.25], abs=0.1)
+    assert refused is not None and refused["reason"] == "malformed" and "field 'temperature'" in refused["detail"]
+    assert process.returncode == 0, said

@@ -1,0 +1,78 @@
+"""Public names: short signatures, words of the glossary, and where to find what bears another name now."""
+
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+
+from tests.test_structure import PUBLIC, SOURCE
+
+ROOT = Path(__file__).parents[1]
+GLOSSARY = ROOT / "docs" / "notation.md"
+LONGEST = 300  # characters of a signature in `help()`
+ENDINGS = ("s", "es", "d", "ed", "ing", "ings", "ion", "ions", "er", "ly", "ability", "able", "ness")
+
+
+def test_signatures_are_short_enough_to_read():
+    shown = {}
+    for place, name in PUBLIC:
+        try:
+            shown[f"{place}.{name}"] = str(inspect.signature(getattr(import_module(place), name)))
+        except (TypeError, ValueError):  # no callable, or one of another library without a signature
+            continue
+    assert len(shown) > 200
+    long = {name: len(text) for name, text in shown.items() if len(text) >= LONGEST}
+    assert not long, "\n".join(f"{name}: {size}" for name, size in sorted(long.items()))
+
+
+def test_every_public_name_uses_words_of_the_glossary():
+    """`GainAndNoise`, `gpb1_filter`: each part between underscores, capitals and digits, but for its ending."""
+    known = glossary()
+    names = [name for _, name in PUBLIC if name.lower() not in known]
+    unknown = {name: lacking for name in names if (lacking := [w for w in words(name) if not stems(w) & known])}
+    assert not unknown, "\n".join(f"{name}: {', '.join(lacking)}" for name, lacking in unknown.items())
+    assert "foretold" not in known and not stems("tape") & known  # it can fail
+
+
+def glossary() -> set[str]:
+    """Stems of the second column of every table of the glossary, and of its list of plain words."""
+    page = GLOSSARY.read_text()
+    rows = [re.split(r"(?<!\\)\|", row)[1:-1] for row in page.splitlines() if row.startswith("| ")]
+    columns = [row[1] for row in rows if len(row) == 5]
+    plain = page.split("Plain words", 1)[1].split(":", 1)[1]
+    listed = re.findall(r"[a-z]+", " ".join([*columns, plain]).lower())
+    return set().union(*map(stems, listed))
+
+
+def words(name: str) -> list[str]:
+    """Parts of a name in small letters."""
+    return [part.lower() for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+
+
+def stems(word: str) -> set[str]:
+    """The word itself, and it without an ending of plurals, verbs and adjectives."""
+    return {word} | {word.removesuffix(end) for end in ENDINGS if len(word) - len(end) >= 3 and word.endswith(end)}
+
+
+def test_new_names_stand_in_the_changes_and_in_contributing():
+    unreleased = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1]
+    page = (ROOT / "CONTRIBUTING.md").read_text().split("\n## What has another name now")[1]
+    changes, copied = ([row for row in text.splitlines() if row.startswith("|")] for text in (unreleased, page))
+    assert len(changes) > 10
+    missing = [row for row in changes if row not in copied]
+    assert changes == copied, "copy the table of the changes to CONTRIBUTING; it lacks\n" + "\n".join(missing)
+
+
+def test_files_are_named_by_what_a_newcomer_looks_for():
+    """Each file of the map is there; where the map says that a name answers, a word of the question is in it."""
+    page = (ROOT / "CONTRIBUTING.md").read_text().split("\n## Find the file")[1].split("\n## ")[0]
+    rows = [row.strip("|").split(" | ") for row in page.splitlines() if row.startswith("| ") and "`" in row]
+    files = [re.findall(r"`([\w/]+\.py)`", row[1]) for row in rows]
+    gone = [name for names in files for name in names if not (SOURCE / name).exists()]
+    assert not gone, gone
+    questions = [(row, names) for row, names in zip(rows, files, strict=True) if len(row) == 3]
+    answered = [(row[0], names[0]) for row, names in questions if row[2].strip() == "yes"]
+    for question, name in answered:
+        asked_for = set().union(*(stems(word) for word in re.findall(r"[a-z]+", question.lower())))
+        assert set().union(*(stems(word) for word in re.findall(r"[a-z]+", Path(name).stem))) & asked_for, name
+    assert len(questions) == 16 and len(answered) >= 14
