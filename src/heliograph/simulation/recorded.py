@@ -35,11 +35,11 @@ Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | Array
 def run(
     network: "Network",
     measurements: "Mapping[str, ArrayLike]",
-    inputs: Float[ArrayLike, "steps inputs"] | None = None,
-    time: Float[ArrayLike, " steps"] | None = None,
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+    time: "ArrayLike | None" = None,
     truth: "Float[ArrayLike, 'steps n'] | None" = None,
     smooth: "AbstractSmoothing | None" = None,
-    reports: Reports | None = None,
+    reports: "Reports | None" = None,
 ) -> "Record":
     """Run every filter of the network over recorded measurements.
 
