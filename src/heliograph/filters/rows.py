@@ -33,11 +33,11 @@ class Filtered:
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
     """
 
-    means: Float[np.ndarray, "steps n"]
-    covariances: Float[np.ndarray, "steps n n"]
-    innovations: Float[np.ndarray, "steps received"]
-    innovation_covariances: Float[np.ndarray, "steps received received"]
-    log_likelihoods: Float[np.ndarray, " steps"]
+    means: "Float[np.ndarray, 'steps n']"
+    covariances: "Float[np.ndarray, 'steps n n']"
+    innovations: "Float[np.ndarray, 'steps m']"
+    innovation_covariances: "Float[np.ndarray, 'steps m m']"
+    log_likelihoods: "Float[np.ndarray, ' steps']"
     claim: Claim
 
     @property

@@ -78,9 +78,9 @@ def markov_fading(
 
 
 def autoregressive_fading(
-    mean: ArrayLike,
-    deviation: ArrayLike,
-    correlation: ArrayLike,
+    mean: Float[ArrayLike, ""],
+    deviation: Float[ArrayLike, ""],
+    correlation: Float[ArrayLike, ""],
     noise: NoiseLike,
     dimension: int = 1,
     name: str | None = None,

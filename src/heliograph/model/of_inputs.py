@@ -6,12 +6,13 @@ from typing import NoReturn
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike
 
-MatrixFunction = Callable[[jax.Array], ArrayLike]  # a matrix from the input u
+MatrixFunction = TypeAliasType("MatrixFunction", Callable[[jax.Array], ArrayLike])  # a matrix of the input u
 
 
 class OfInputs(Module):

@@ -172,14 +172,14 @@ class LinearPlant(AbstractPlant):
 
     def __init__(
         self,
-        matrix: ArrayLike | MatrixFunction,
-        noise: NoiseLike | NoiseFunction,
+        matrix: "ArrayLike | MatrixFunction",
+        noise: "NoiseLike | NoiseFunction",
         initial_mean: ArrayLike,
-        initial_covariance: NoiseLike,
-        input_matrix: ArrayLike | MatrixFunction | None = None,
-        states: Sequence[str] | None = None,
-        inputs: Sequence[str] | None = None,
-        circular: Sequence[str] = (),
+        initial_covariance: "NoiseLike",
+        input_matrix: "ArrayLike | MatrixFunction | None" = None,
+        states: "Sequence[str] | None" = None,
+        inputs: "Sequence[str] | None" = None,
+        circular: "Sequence[str]" = (),
     ):
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]

@@ -3,17 +3,17 @@
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.noise import NoiseLike
 
 
 def state_space(
-    F: Float[ArrayLike, "n n"],
-    H: Float[ArrayLike, "m n"],
-    Q: AbstractNoise | Float[ArrayLike, "n n"],
-    R: AbstractNoise | Float[ArrayLike, "m m"],
-    mean: Float[ArrayLike, " n"],
-    covariance: AbstractNoise | Float[ArrayLike, "n n"],
-    B: Float[ArrayLike, "n inputs"] | None = None,
+    F: "Float[ArrayLike, 'n n']",
+    H: "Float[ArrayLike, 'm n']",
+    Q: "NoiseLike",
+    R: "NoiseLike",
+    mean: "Float[ArrayLike, ' n']",
+    covariance: "NoiseLike",
+    B: "Float[ArrayLike, 'n inputs'] | None" = None,
 ) -> tuple[LinearPlant, LinearSensor]:
     """Return the plant x+ = F x + B u + w and the sensor z = H x + v, with Cov(w) = Q and Cov(v) = R.
 

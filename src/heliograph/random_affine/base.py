@@ -335,8 +335,8 @@ def with_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
             return part
         return eqx.tree_at(lambda m: m.memory, part, twins[part.memory.identity])
 
-    changed: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
-    return changed
+    result: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
+    return result
 
 
 def _is_modal(item: object) -> bool:

@@ -35,11 +35,11 @@ Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | Array
 def run(
     network: "Network",
     measurements: "Mapping[str, ArrayLike]",
-    inputs: Float[ArrayLike, "steps inputs"] | None = None,
-    time: Float[ArrayLike, " steps"] | None = None,
-    truth: Float[ArrayLike, "steps n"] | None = None,
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+    time: "ArrayLike | None" = None,
+    truth: "Float[ArrayLike, 'steps n'] | None" = None,
     smooth: "AbstractSmoothing | None" = None,
-    reports: Reports | None = None,
+    reports: "Reports | None" = None,
 ) -> "Record":
     """Run every filter of the network over recorded measurements.
 
@@ -148,8 +148,9 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 
 def _filtered(*arguments: PyTree) -> PyTree:
-    """Results of `_run_filters` as NumPy arrays."""
-    if arguments[0].meshes:  # nodes by the hundred are no straight-line code
+    """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
+    filters = arguments[0]
+    if filters.meshes:  # nodes by the hundred are no straight-line code
         return to_numpy(_by_xla(*arguments))
     return computed(_run_filters, _by_xla, arguments)
 

@@ -74,9 +74,15 @@ class GaussianFilter(AbstractBeliefFilter):
         # F, Q and M H of the step.
         u = jnp.asarray(u)
         observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
-        transition = plant.transition_matrix(u)
         step = linear_smoother_step(
-            after, prior, transition, process, observed_of, innovation.value, innovation.covariance, self.claim
+            after,
+            prior,
+            plant.transition_matrix(u),
+            process,
+            observed_of,
+            innovation.value,
+            innovation.covariance,
+            self.claim,
         )
         return replace(step, angles=plant.angles)
 

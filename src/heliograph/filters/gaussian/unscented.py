@@ -84,14 +84,14 @@ class Unscented(AbstractTransform):
 def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
-    alpha: Scalar = 1e-3,
-    beta: Scalar = 2.0,
-    kappa: Scalar = 0.0,
-    update: AbstractUpdate | None = None,
-    initial_mean: Float[ArrayLike, " n"] | None = None,
-    initial_covariance: Float[ArrayLike, "n n"] | None = None,
-) -> GaussianFilter:
+    channel: "Channel",
+    alpha: float = 1e-3,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+    update: "AbstractUpdate | None" = None,
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+) -> "GaussianFilter":
     """Unscented Kalman filter (UKF) on its channel's second moments; the points are redrawn after each prediction.
 
     Merwe's points by default; Julier's are alpha = 1, beta = 0; with kappa = 0 besides it is `cubature_filter`, which
