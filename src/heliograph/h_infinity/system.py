@@ -86,7 +86,7 @@ def growth_system(
             over fewer steps than `steps`.
     """
     check_count("steps", steps)
-    B = _over(steps, "disturbance matrix", disturbance, ("states", "disturbances"))
+    B = _over(steps, "disturbance matrix", disturbance, (None, None))
     n, v = B.shape[1:]
     D = _over(steps, "feedthrough matrix", feedthrough, (None, v))
     y = D.shape[1]
