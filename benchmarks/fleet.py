@@ -23,9 +23,8 @@ from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.message import read_message
 from heliograph.serving.service import Service
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.in_memory_store import InMemoryStore
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import InMemoryStore, identity
 
 PLANTS, STEPS, BATCH, SPACING, WINDOW, ROUNDS = 1000, 60, 8192, 0.5, 5.0, 3
 LIMIT = 20.0  # 50,000 steps a second, on two processors

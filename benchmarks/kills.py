@@ -22,9 +22,9 @@ from heliograph.files.network_file import load_network
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
-from heliograph.serving.storage.identity import identity
 from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import identity
 
 NETWORK = """
 import jax.numpy as jnp

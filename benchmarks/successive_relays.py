@@ -13,8 +13,7 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.relays.design import start_moments
-from heliograph.relays.own_error import _propagate_own
+from heliograph.relays.design import _propagate_own, start_moments
 from heliograph_studies.successive_relays.setting import Setting
 
 STEPS = 100

@@ -26,8 +26,7 @@ SHAPED = re.compile(r"(Float|Int|Bool|Shaped|Num|Real|Inexact)\[[^\[\]]*\]")
 LONG = 15  # lines of a function that needs a comment above its steps
 SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
 Function = ast.FunctionDef | ast.AsyncFunctionDef
-LATER = {"h_infinity", "learning", "planning"}  # rooms whose docstrings are still to be written anew
-PATHS = sorted(p for p in SOURCE.rglob("*.py") if p.relative_to(SOURCE).parts[0] not in LATER)
+PATHS = sorted(SOURCE.rglob("*.py"))
 
 
 def definitions(path: Path) -> Iterator[Function | ast.ClassDef]:

@@ -26,6 +26,10 @@ from .random_affine.law import (
 from .random_affine.noise import (
     Gaussian as Gaussian,
 )
+from .random_affine.outliers import (
+    Contaminated as Contaminated,
+    StudentT as StudentT,
+)
 from .model.plant import (
     LinearPlant as LinearPlant,
     Plant as Plant,
@@ -48,6 +52,15 @@ from .model.fading import (
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
 )
+from .model.trigger import (
+    Periodic as Periodic,
+    SendOnDelta as SendOnDelta,
+    SendOnPredictionError as SendOnPredictionError,
+    StochasticTrigger as StochasticTrigger,
+)
+from .filters.event.factory import (
+    event_filter as event_filter,
+)
 from .filters.gaussian.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
@@ -61,6 +74,12 @@ from .filters.linear.linear import (
 )
 from .filters.linear.polynomial import (
     polynomial_filter as polynomial_filter,
+)
+from .filters.gaussian.adaptive import (
+    adaptive_filter as adaptive_filter,
+)
+from .filters.gaussian.robust import (
+    robust_filter as robust_filter,
 )
 from .filters.modes.mixture import (
     mixture_filter as mixture_filter,

@@ -10,7 +10,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import explore, open_results
-from heliograph.campaign.detail import Detail, details
+from heliograph.campaign.explore import Detail, details
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.store import STORE, stored_campaign
 from heliograph.campaign.summary import SUMMARY, Score, read_summary

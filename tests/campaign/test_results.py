@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.campaign.reducer import Errors
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import _score, open_results, read_summary
+from heliograph.campaign.work import Errors
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, chunk_files, contents, write
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 from heliograph import cli
+from heliograph.campaign.failures import Failure
 from heliograph.campaign.figures import NEES, RMSE, against, by_setting, campaign_figures
 from heliograph.campaign.page import campaign_page
 from heliograph.campaign.summary import read_summary
@@ -103,13 +104,7 @@ def test_words_make_no_axis(tmp_path, finished):
 
 
 def test_the_page_says_what_failed(tmp_path, finished, fits):
-    entry = {
-        "setting": 3,
-        "parameters": {"gain": 0.7},
-        "runs": [64, 99],
-        "error": "RuntimeError: <bad> luck",
-        "command": "heliograph sweep x",
-    }
+    entry = Failure(3, {"gain": 0.7}, 1, (64, 99), (5, 0, 0), "RuntimeError: <bad> luck", "", "heliograph sweep x")
     html = campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
     fits(html)
     for text in ("What failed", "RuntimeError: &lt;bad&gt; luck", "heliograph sweep x", "runs 64 to 99"):

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.accumulated import Accumulated
-from heliograph.codegen.program import lower, scalars
+from heliograph.codegen.program import Summed, folded, lower, row_length, scalars
 from heliograph.codegen.rules.arrived import arrived
-from heliograph.codegen.summed import Summed, folded, row_length
 
 BATCHES, STEPS = 50, 4
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.model import centred, delayed, expected_signal
-from heliograph.random_affine.base import conditional_moments
 from heliograph.random_affine.moments.second_moments import second_order
+from tests.random_affine.conditional import conditional_moments
 
 HORIZON, RUNS = 8, 4000
 Z_LIMIT = 4.0  # one number in 30,000 beyond it by chance; the seed is fixed and a few dozen numbers are compared

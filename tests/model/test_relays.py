@@ -8,8 +8,7 @@ from heliograph.model.plant import LinearPlant, Plant
 from heliograph.model.relays import RelayNetwork, link_moments
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.law import bernoulli
-from heliograph.relays.design import given_design, relay_schedules
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import given_design, own_error_design, relay_schedules
 from tests.relays.relay_problems import example, unusual
 
 PLANT = LinearPlant([[0.9]], [[1.0]], [0.0], [[1.0]])

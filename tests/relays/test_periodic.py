@@ -9,8 +9,7 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.relays.descent import bfgs
-from heliograph.relays.design import given_design
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import given_design, own_error_design
 from heliograph.relays.periodic import periodic_behind_relays, periodic_given_design, periodic_own_error_design
 from heliograph.relays.periodic_tuning import periodic_receiver_error_design, periodic_relays_for_best_receiver
 from heliograph.relays.receiver import receiver_behind_relays

@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from heliograph.relays.check import recompute
-from heliograph.relays.design import given_design
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import given_design, own_error_design
 from heliograph.relays.receiver_error import receiver_error_design
+from heliograph_studies.successive_relays.raw_moments import recompute
 from tests.relays.relay_problems import example, relative, unusual
 
 HORIZON = 100

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from heliograph.model.relays import RelayNetwork
-from heliograph.relays.check import recompute
-from heliograph.relays.design import given_design
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import given_design, own_error_design
+from heliograph_studies.successive_relays.raw_moments import recompute
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, gains_of, network_of, relative, unusual
 

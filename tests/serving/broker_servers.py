@@ -14,8 +14,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.partition import Part, word
-from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.transport import Part, Transport, word
 from heliograph.serving.brokers.url import Address, address
 from heliograph_studies.live.server import Server
 

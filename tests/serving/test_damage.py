@@ -11,10 +11,8 @@ import pytest
 from heliograph.numerics.check import InputError
 from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.store import Store
-from heliograph.serving.storage.store_protocol import Damage
-from heliograph.serving.storage.tables import LAYOUT
+from heliograph.serving.storage.store import LAYOUT, Store
+from heliograph.serving.storage.store_protocol import Damage, identity
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 SENT = lines(messages(2, 24, seed=11, whole=True))

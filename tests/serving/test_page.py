@@ -13,8 +13,7 @@ from scipy.stats import chi2
 
 pytest.importorskip("uvicorn")
 from heliograph.serving.page import Door, door, shown
-from heliograph.serving.running_nis import DOUBT, MEMORY, RunningNis
-from heliograph.serving.watch import Watch
+from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch
 from tests.serving.watched import Scripted
 from tests.widths import program
 

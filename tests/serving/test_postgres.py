@@ -8,8 +8,8 @@ from sqlalchemy import text
 
 from heliograph.serving.service import Service
 from heliograph.serving.storage.database import engine_at
-from heliograph.serving.storage.identity import identity
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import identity
 from tests.postgres import Postgres
 from tests.serving import test_sharing
 from tests.serving.storage.test_store import by_plant, journal, states

@@ -14,7 +14,7 @@ import heliograph as hg
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
-from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
 READER = TypeAdapter(AnyOutput)

@@ -19,12 +19,12 @@ import nats
 from sqlalchemy import Engine, update
 
 import heliograph
-from heliograph.serving.brokers.partition import word
+from heliograph.serving.brokers.transport import word
 from heliograph.serving.service import Service
 from heliograph.serving.storage import leases
 from heliograph.serving.storage.database import engine_at
-from heliograph.serving.storage.in_memory_store import InMemoryStore
 from heliograph.serving.storage.leases import Leases
+from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 

@@ -32,6 +32,9 @@ class Scripted:
     malformed: int = 0
     last: Last = field(default_factory=Last)
 
+    def dead_senders(self) -> dict[str, int]:
+        return {}
+
     def unpublished(self) -> list[Output]:
         return []
 

@@ -4,11 +4,10 @@ import json
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypedDict
 
 from heliograph.campaign.plan import Campaign, Setting
 from heliograph.campaign.work import Job, Reply
-from heliograph.disk.durable import naming, replace
+from heliograph.disk.whole_file import naming, replace
 
 FAILURES = "failures.json"
 
@@ -28,6 +27,7 @@ class Failure:
     key: tuple[int, int, int]
     error: str
     traceback: str
+    command: str  # that repeats it alone
 
     def __str__(self) -> str:
         """Describe in one line what failed and why."""
@@ -35,27 +35,13 @@ class Failure:
         return f"setting {self.setting} ({values}), runs {self.runs[0]} to {self.runs[1]}: {self.error}"
 
 
-class Entry(TypedDict):
-    """A failure as stored in failures.json, with the command that repeats it alone."""
-
-    setting: int
-    parameters: Setting
-    chunk: int | None
-    runs: tuple[int, int]
-    key: tuple[int, int, int]
-    error: str
-    traceback: str
-    command: str
-
-
-def read_failures(out: Path) -> list[Entry]:
+def read_failures(out: Path) -> list[Failure]:
     """Read failures.json next to the store; return an empty list if there is no such file."""
     path = out / FAILURES
-    entries: list[Entry] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    return entries
+    return [Failure(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))] if path.is_file() else []
 
 
-def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
+def failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Failure:
     """Describe a job that failed, from its last reply."""
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
@@ -67,16 +53,17 @@ def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
         key=(campaign.seed, *campaign.words(job.setting)),
         error=reply.error,
         traceback=reply.traceback,
+        command=_command(campaign, out, job),
     )
 
 
-def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried: list[Job]) -> None:
+def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None:
     """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file."""
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
-    left = [entry for entry in read_failures(out) if Job(entry["setting"], entry["chunk"]) not in jobs]
-    entries = [*left, *(asdict(item) | {"command": command(campaign, out, item)} for item in failures)]
+    left = [item for item in read_failures(out) if Job(item.setting, item.chunk) not in jobs]
+    entries = [asdict(item) for item in (*left, *failures)]
     if not entries:
         path.unlink(missing_ok=True)
         partial.unlink(missing_ok=True)  # of a process that was killed
@@ -86,7 +73,7 @@ def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried
     replace(partial, path)
 
 
-def command(campaign: Campaign, out: Path, item: Failure) -> str:
+def _command(campaign: Campaign, out: Path, job: Job) -> str:
     """Return the command that repeats a failure, alone and in one process."""
-    words = ["heliograph", "sweep", campaign.path, "--out", str(out.absolute()), "--setting", str(item.setting)]
-    return shlex.join(words if item.chunk is None else [*words, "--chunk", str(item.chunk)])
+    words = ["heliograph", "sweep", campaign.path, "--out", str(out.absolute()), "--setting", str(job.setting)]
+    return shlex.join(words if job.chunk is None else [*words, "--chunk", str(job.chunk)])

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from heliograph.campaign.failures import FAILURES, Entry, read_failures
+from heliograph.campaign.failures import FAILURES, Failure, read_failures
 from heliograph.campaign.figures import PANELS, campaign_figures
 from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.show import score_headers, score_row
@@ -26,7 +26,7 @@ def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path
     return path
 
 
-def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Entry]) -> Page:
+def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
     """Return the report of a campaign with its scores and failures."""
     name = Path(campaign.path).name
     there = sum({score.setting: score.runs for score in scores}.values())
@@ -65,18 +65,17 @@ def finding(scores: Sequence[Score]) -> str:
     return f"“{visible(name)}” has the least error in {count} of {len(compared)} cases"
 
 
-def _failed(failures: Sequence[Entry]) -> str:
+def _failed(failures: Sequence[Failure]) -> str:
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
-def _failures(failures: Sequence[Entry]) -> Section:
+def _failures(failures: Sequence[Failure]) -> Section:
     points = [
-        f"setting {entry['setting']} {entry['parameters']}, runs {entry['runs'][0]} to {entry['runs'][1]}: "
-        f"{entry['error']}"
-        for entry in failures[:REPORTED]
+        f"setting {item.setting} {item.parameters}, runs {item.runs[0]} to {item.runs[1]}: {item.error}"
+        for item in failures[:REPORTED]
     ]
     text = f"Tried three times. All of them, with tracebacks, are in {FAILURES}; run one again alone by its command:"
-    return Section("What failed", [Points(points), Text([text]), Code(failures[0]["command"])])
+    return Section("What failed", [Points(points), Text([text]), Code(failures[0].command)])
 
 
 def pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:

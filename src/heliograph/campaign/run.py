@@ -7,14 +7,17 @@ from pathlib import Path
 
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, failure, write_failures
-from heliograph.campaign.labels import Description, check_within, join, labels_from
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
+    Description,
     check_same,
+    check_within,
     create,
     described,
     done_chunks,
+    join,
+    labels_from,
     remove_damaged,
     remove_partial,
     stored_labels,
@@ -23,8 +26,7 @@ from heliograph.campaign.store import (
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
 from heliograph.disk.holding import only_here
-from heliograph.disk.output_file import check_output_folder
-from heliograph.disk.output_folder import check_replaceable, clear_left
+from heliograph.disk.output_file import check_output_folder, check_replaceable, clear_left
 from heliograph.numerics.check import check_count, fail, file_path, instance
 from heliograph.numerics.readable import readable
 
@@ -124,8 +126,8 @@ def _run(
             failed = _compute(engine, campaign, store, missing, already, tell)
     remove_partial(store)
     # Reports are written again after every call.
-    failures = [failure(campaign, job, reply) for job, reply in failed.items()]
-    write_failures(out, campaign, failures, tried=expected)
+    failures = [failure(campaign, out, job, reply) for job, reply in failed.items()]
+    write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
     return CampaignRun(out, already, len(missing) - lacking, failures, damaged)

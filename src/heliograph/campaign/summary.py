@@ -10,8 +10,8 @@ import zarr
 
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
-from heliograph.disk.durable import naming, replace
 from heliograph.disk.quoting import from_cell, in_cell
+from heliograph.disk.whole_file import naming, replace
 from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:

@@ -1,8 +1,9 @@
-"""The application that holds the commands, and the types of their options."""
+"""The application that holds the commands, the types of their options, and completion in a shell."""
 
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter, Token
 
@@ -48,3 +49,10 @@ def _path(_: type, tokens: Sequence[Token]) -> Path:
     if not tokens[0].value or "\0" in tokens[0].value:
         raise ValueError(f"expected a path, got {tokens[0].value!r}")
     return Path(tokens[0].value)
+
+
+def completion(
+    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(help="Which shell.")], /
+) -> None:
+    """Print a shell's completion script; in bash: eval "$(heliograph completion bash)"."""
+    print(app.generate_completion(prog_name="heliograph", shell=shell))

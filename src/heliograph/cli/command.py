@@ -7,11 +7,9 @@ from contextlib import suppress
 
 from cyclopts import CycloptsError
 
-from heliograph.cli.app import app
+from heliograph.cli.app import app, completion
 from heliograph.cli.check import check
-from heliograph.cli.completion import completion
 from heliograph.cli.design import design
-from heliograph.cli.explore import explore
 from heliograph.cli.export import export
 from heliograph.cli.fit import fit
 from heliograph.cli.new import new
@@ -20,7 +18,7 @@ from heliograph.cli.run import run
 from heliograph.cli.serve import serve
 from heliograph.cli.stopping import INTERRUPTED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
-from heliograph.cli.sweep import sweep
+from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 

@@ -64,14 +64,19 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     advance("starting")
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.recording import Recording, read_recording
+    from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
     from heliograph.learning.losses.losses import learn_losses_of
     from heliograph.learning.losses.stretches import fates_of_measurements
+    from heliograph.learning.senders import decides
+    from heliograph.numerics.check import fail
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)
     start = build()
+    if decides(start):
+        raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
     recording = read_recording(measurements, start)
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
@@ -86,6 +91,7 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
     result = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    assert isinstance(result, Fit)  # since no sender decides
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
     judged = changes(start, result.network, recording.measurements, recording.inputs, cut) if cut < rows else []

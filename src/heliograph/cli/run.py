@@ -62,7 +62,7 @@ def run(
 
         # Filter: events through a timeline, rows at once.
         loaded = load_network(network)
-        if not any(node.filters for node in loaded.nodes.values()):
+        if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         if events and out is not None:
             advance("filtering events")
@@ -134,7 +134,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.disk.output_folder import check_replaceable
+        from heliograph.disk.output_file import check_replaceable
         from heliograph.report.results import NEEDS, SUMMARY
 
         for name in NEEDS:
@@ -151,5 +151,5 @@ def _write_report(name: str, network: "Network", record: "Record", recording: "R
 
         return run_results(health, name)
 
-    count = sum(len(node.filters) for node in network.nodes.values())
+    count = sum(map(len, network.claims().values()))
     write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), tell)

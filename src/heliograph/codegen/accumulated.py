@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.codegen.compiled import aligned, best_width, pointers_to
+from heliograph.codegen.compiled import Machine, aligned, best_width, features, pointers_to
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.llvm.machine import Machine, features
 from heliograph.codegen.llvm.module import written
-from heliograph.codegen.program import Program
-from heliograph.codegen.summed import Summed, row_length
+from heliograph.codegen.program import Program, Summed, row_length
 
 
 class Accumulated:

@@ -1,5 +1,6 @@
-"""Functions of one run, compiled for many: called on arrays with a leading axis of runs, on all cores."""
+"""Functions of one run, compiled for many: LLVM IR as code of this machine, called on arrays of runs, on all cores."""
 
+import ctypes
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,13 +10,50 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
+import llvmlite.binding as llvm
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.llvm.machine import Machine, features
 from heliograph.codegen.llvm.module import LINE, Code, written
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
+
+Function = Callable[[int, int, int, int, int], None]
+SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+
+
+@cache
+def target() -> llvm.Target:
+    """Return the LLVM target of this machine."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple()
+
+
+@cache
+def features() -> tuple[str, str, bool]:
+    """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
+    result = llvm.get_host_cpu_features()
+    arm = "aarch64" in target().triple or "arm64" in target().triple
+    return llvm.get_host_cpu_name(), result.flatten(), bool(result.get("fma")) or arm
+
+
+class Machine:
+    """Code of one text; its function `run` may be called as long as this object exists.
+
+    LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
+    """
+
+    def __init__(self, text: str):
+        level = 0 if jax.config.values["jax_disable_most_optimizations"] else 1
+        cpu, flags, *_ = features()
+        machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
+        module = llvm.parse_assembly(text)
+        module.verify()
+        self.engine = llvm.create_mcjit_compiler(module, machine)
+        self.engine.finalize_object()
+        self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
+
 
 LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little

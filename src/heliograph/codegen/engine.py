@@ -12,9 +12,8 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from heliograph.codegen.compiled import Compiled
+from heliograph.codegen.compiled import Compiled, target
 from heliograph.codegen.graph import Unsupported
-from heliograph.codegen.llvm.machine import target
 from heliograph.codegen.lowering import like
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown

@@ -1,23 +1,26 @@
-"""Lowered programs: inputs and outputs, and the nodes and statements that these need."""
+"""Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
+
+Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, so
+that W consecutive runs of a block never wrap around; what is beyond the end is added to the beginning (`folded`).
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen.graph import Buffer, Graph, Guard, Key, Loop, Node, Store
+from heliograph.codegen.graph import Block, Buffer, Graph, Guard, Key, Loop, Node, Store
 from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     arrived,
-    branches,
     calls,
-    eigen,
+    decompositions,
     elementwise,
     indexing,
     loops,
-    lu,
     matrices,
     random_bits,
     rows,
@@ -106,3 +109,119 @@ def _arguments(item: Any) -> list[Any]:
         guard, place = item.value
         return [guard, guard.values[place]]
     return list(item.args)
+
+
+def fusable(node: Node, products: set[Node]) -> Node | None:
+    """Return the product that is computed with a sum or difference as one operation."""
+    if node.op not in ("add", "sub") or node.type != "f64":
+        return None
+    results = [a for a in node.args if a in products and a.value is node]
+    return results[0] if results else None
+
+
+def products_of(items: Iterable[Any]) -> set[Node]:
+    """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
+    users: dict[Node, list[Any]] = {}
+    for item in items:
+        for used in uses(item):
+            users.setdefault(used, []).append(item)
+    results: set[Node] = set()
+    taken: set[Node] = set()
+    for node in sorted((n for n in users if n.op == "mul" and n.type == "f64"), key=lambda n: -n.serial):
+        user = users[node][0]
+        single = len(users[node]) == 1 and isinstance(user, Node) and user.op in ("add", "sub")
+        if single and user.args[0] is not user.args[1] and user.block is node.block and user not in taken:
+            node.value = user
+            results.add(node)
+            taken.add(user)
+    return results
+
+
+def uses(item: Any) -> list[Node]:
+    """Return the nodes that an item of a program uses directly."""
+    if isinstance(item, Node):
+        return list(item.args)
+    if isinstance(item, Store):
+        return [item.node, *item.indices]
+    if isinstance(item, Guard):
+        return [item.condition, *item.values]
+    if isinstance(item, Loop):
+        return [*item.initial, *item.following, *([] if item.condition is None else [item.condition])]
+    return []
+
+
+def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any]:
+    """Return nodes, buffers, loops and guards that differ between runs if these input buffers do."""
+    results: set[Any] = set(inputs)
+    items = sorted(needed(roots), key=_order)
+    count = -1
+    while count != len(results):
+        count = len(results)
+        results.update(item for item in items if item not in results and _varies(item, results))
+    return results
+
+
+def _order(item: Any) -> int:
+    return item.serial if isinstance(item, Node) else 0
+
+
+def _varies(item: Any, result: set[Any]) -> bool:
+    if isinstance(item, Buffer):
+        owner = item.owner[0]
+        if owner is not item:
+            return owner in result
+        return any(store.node in result or _is_apart(store.block, result) for store in _stores(item))
+    # Statements: a loop differs by its condition, a store makes its buffer differ.
+    if isinstance(item, Loop):
+        return item.length is None and (item.condition in result or any(p in result for p in item.parameters))
+    if isinstance(item, Guard):
+        return item.condition in result
+    if isinstance(item, Store):
+        if item.node in result or _is_apart(item.block, result):
+            result.add(item.buffer.owner[0])
+            return True
+        return False
+    # Nodes: by their block, by memory, by the carry, else by their arguments.
+    if item.op in ("constant", "counter"):
+        return False
+    if _is_apart(item.block, result):
+        return True
+    if item.op == "load":
+        return item.value[0].owner[0] in result or any(i in result for i in item.args)
+    if item.op in ("parameter", "result"):
+        loop, place = item.value
+        return loop in result or loop.initial[place] in result or loop.following[place] in result
+    if item.op == "guarded":
+        guard, place = item.value
+        return guard in result or guard.values[place] in result
+    return any(a in result for a in item.args)
+
+
+def _stores(buffer: Buffer) -> list[Store]:
+    return buffer.stores
+
+
+def _is_apart(block: Block, result: set[Any]) -> bool:
+    """Return whether a block lies in a loop or guard that differs between runs."""
+    return any(b.owner in result for b in block.inwards() if b.owner is not None)
+
+
+class Summed(NamedTuple):
+    """Outputs that are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
+
+    outputs: tuple[bool, ...]
+    batches: int
+    number: int
+
+
+def row_length(width: int, batches: int) -> int:
+    """Return the length of a row of sums."""
+    return batches + width - 1
+
+
+def folded(sums: np.ndarray, batches: int) -> np.ndarray:
+    """Return sums (..., batch) from rows (..., `row_length`)."""
+    result = sums[..., :batches].copy()
+    beyond = sums[..., batches:]
+    result[..., : beyond.shape[-1]] += beyond
+    return result

@@ -1,4 +1,4 @@
-"""A file that appears whole or not at all, and several that appear together."""
+"""Files that appear whole or not at all, together if there are several, also after a power failure."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -6,7 +6,38 @@ from contextlib import contextmanager
 from glob import escape as glob_escape
 from pathlib import Path
 
-from heliograph.disk.durable import naming, replace
+
+def sync(path: Path) -> None:
+    """Flush a file or folder to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_tree(folder: Path) -> None:
+    """Flush a folder with all its contents to the disk."""
+    for path in (*folder.rglob("*"), folder):
+        sync(path)
+
+
+def replace(partial: Path, path: Path) -> None:
+    """Move a complete file to `path`, atomically, over an existing file if there is one."""
+    sync(partial)
+    os.replace(partial, path)
+    sync(path.parent)
+
+
+@contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Add the path to errors of the system that lack one, such as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager

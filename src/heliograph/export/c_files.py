@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from heliograph.codegen.c.operations import Real
+from heliograph.codegen.c_source import Real
 from heliograph.disk.output_file import check_output
 from heliograph.disk.whole_file import whole_files
 from heliograph.export.program import step_program

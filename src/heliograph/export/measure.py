@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from heliograph.codegen.c.operations import Real
+from heliograph.codegen.c_source import Real
 
 COMPILER = "cc"
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")

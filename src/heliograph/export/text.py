@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph
-from heliograph.codegen.c.operations import Real, c_type, literal
-from heliograph.codegen.c.source import CSource, Place
+from heliograph.codegen.c_source import CSource, Place, Real, c_type, literal
 from heliograph.codegen.graph import Node, Type, Unsupported
 from heliograph.disk.quoting import visible
 from heliograph.export.program import StepProgram, no_c, place_of

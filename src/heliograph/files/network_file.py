@@ -88,11 +88,7 @@ def _pick(module: ModuleType, name: str, place: str, path: Path | None) -> Netwo
     if networks:
         choices = " or ".join(f"{place}:{key}" for key in networks)
         raise fail(f"network {place}", f"a name, as {choices}", f"none, and {len(networks)} networks")
-    raise fail(
-        f"network {place}",
-        f"a heliograph.Network (or {place}:FUNCTION that returns one)",
-        "none in the module",
-    )
+    raise fail(f"network {place}", f"a heliograph.Network (or {place}:FUNCTION that returns one)", "none in the module")
 
 
 def _named(module: ModuleType, name: str, place: str, path: Path | None, networks: dict[str, Network]) -> Network:

@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .gaussian.adaptive import (
+    AdaptiveFilter as AdaptiveFilter,
+)
 from .base import (
     AbstractFilter as AbstractFilter,
     corrects as corrects,
@@ -14,6 +17,8 @@ from .gaussian.correction import (
 )
 from .wrappers.delay import (
     late_filter as late_filter,
+)
+from .wrappers.part import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (
@@ -58,6 +63,9 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
+from .gaussian.robust import (
+    RobustFilter as RobustFilter,
+)
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
@@ -73,6 +81,7 @@ from .gaussian.transform import (
     Cubature as Cubature,
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
+    Unscented as Unscented,
 )
 from .gaussian.update import (
     AbstractUpdate as AbstractUpdate,
@@ -83,4 +92,11 @@ from .gaussian.update import (
 from .linear.truth import (
     TrueError as TrueError,
     true_error as true_error,
+)
+from .weights import (
+    Gate as Gate,
+    Huber as Huber,
+    InverseMultiquadric as InverseMultiquadric,
+    StudentVB as StudentVB,
+    WoLF as WoLF,
 )

@@ -22,7 +22,10 @@ from heliograph.numerics.names import offered
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
-__all__ = ["AbstractFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts", "step_number"]
+__all__ = [
+    "AbstractFilter", "AbstractSizedFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts",
+    "step_number",
+]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
@@ -163,9 +166,23 @@ class AbstractFilter(Module):
         return False
 
     @property
+    def silence_tells(self) -> bool:
+        """True if a step at which nothing arrives changes the state and has a likelihood: then none is missing."""
+        return False
+
+    @property
     def horizon(self) -> int | None:
         """Number of steps that it covers; None if there is no last one."""
         return steps_covered(self)
+
+
+class AbstractSizedFilter(AbstractFilter):
+    """Filter that holds its claim and its sizes as fields."""
+
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
 
 @compiled

@@ -2,15 +2,14 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.system import GrowthSystem
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
@@ -26,7 +25,7 @@ class Pending(NamedTuple):
     correction: Float[jax.Array, " n"]
 
 
-class HInfinityFilter(AbstractFilter):
+class HInfinityFilter(AbstractSizedFilter):
     """H-infinity filter in predictor form, xhat+ = f(xhat, u) + K (z - E[G] h(xhat)).
 
     An estimate at step k uses the measurements before step k. There is no covariance to claim: the guarantee is a ratio
@@ -50,10 +49,6 @@ class HInfinityFilter(AbstractFilter):
     gains: OverTime
     expected_gain: OverTime
     initial_mean: np.ndarray
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Pending:

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
-from heliograph.fusion.segments import Parameter, check_range, levels_of, midpoint, parameter, positive, segment_of
+from heliograph.fusion.uniform_quantizer import (
+    Parameter,
+    check_range,
+    levels_of,
+    midpoint,
+    parameter,
+    positive,
+    segment_of,
+)
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import in_float64

@@ -59,11 +59,6 @@ class ReportLink(Module):
         if first(self.channel).remembers:
             raise fail("channel of a report link", "one that forgets", f"{type(first(self.channel)).__name__}")
 
-    @property
-    def may_lack(self) -> bool:
-        """True if a step may pass without the report of that step."""
-        return self.every > 1 or self.delay[0] < 1 or (self.channel is not None and first(self.channel).erases)
-
     def received(self, n: int) -> int:
         """Number of received components of a report of n."""
         return n if self.channel is None else int(first(self.channel).outputs)

@@ -1,4 +1,4 @@
-"""Whether gains, from anywhere, guarantee an H-infinity level: a check that shares nothing with the designs."""
+"""Check that gains, from anywhere, guarantee an H-infinity level, by code that shares nothing with the designs."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,12 +17,18 @@ ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix wh
 
 @readable
 class HInfinityCertificate(NamedTuple):
-    """Whether the level is certified, and every number that this rests on.
+    """Certificate of an H-infinity level, with every number that it rests on.
 
-    largest_eigenvalues: of Theorem 1's matrix, which must be negative; steps_certified counts those from the
-    first on that are. initial: the smallest eigenvalue of level^2 W - P_0, which must be positive. margin: the smallest
-    distance of all of them from failing, with every matrix scaled to a diagonal of -1 or 1. `reasons` lists what fails;
-    `growth` what is known about the growth constants, `assumed` those that nothing proves.
+    Args:
+        certified: true if every condition of Theorem 1 holds and no growth constant is refuted.
+        level: the level gamma, a ratio of norms.
+        largest_eigenvalues: of Theorem 1's matrix at each step (steps,); all must be negative.
+        steps_certified: number of steps, from the first on, at which they are.
+        initial: smallest eigenvalue of level^2 W - P_0, which must be positive.
+        margin: smallest distance of all of these from failing, with every matrix scaled to a diagonal of -1 or 1.
+        growth: what is known about the growth constants.
+        reasons: every condition that fails, in words.
+        assumed: growth constants that no finding proves.
     """
 
     certified: bool
@@ -37,7 +43,7 @@ class HInfinityCertificate(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What is guaranteed, and on what it rests, in a line."""
+        """Guarantee, and the growth constants that it rests on, in one line."""
         if not self.certified:
             return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
         rests = (
@@ -48,17 +54,25 @@ class HInfinityCertificate(NamedTuple):
 
 def certify_level(
     system: GrowthSystem,
-    gains: ArrayLike,
-    weights: ArrayLike,
-    multipliers: ArrayLike,
+    gains: "Float[ArrayLike, 'steps n m']",
+    weights: "Float[ArrayLike, 'steps+1 n+n n+n']",
+    multipliers: "Float[ArrayLike, 'steps count']",
     level: float,
     growth: Sequence[GrowthFinding] = (),
 ) -> HInfinityCertificate:
-    """Check that K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers guarantees the level.
+    """Check that gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
 
-    Multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~. `growth`: what
-    `check_growth` found; what rests on a refuted constant, or on a finding about a constant above the system's, is not
-    certified. Constants that no finding proves are `assumed`, and the certificate says so.
+    Phi_k < 0 at every step, P_k > 0, level^2 W - P_0 > 0 and multipliers >= 0 together prove
+    sum |M e|^2 < level^2 (sum |v|^2 + |rho|^2 + xi_0' W xi_0). A level that rests on a refuted growth constant, or on a
+    finding about a constant above the system's, is not certified.
+
+    Args:
+        system: the system with its growth constants, from `growth_system`.
+        gains: K (steps, n, m).
+        weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
+        multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~.
+        level: gamma, a positive ratio of norms.
+        growth: results of `check_growth` or `check_size`; constants that none of them proves are listed as assumed.
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
@@ -73,13 +87,17 @@ def certify_level(
     K = array("gains", gains, (T, n, m))
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _multipliers(array("multipliers", multipliers, (T, None)))
+    # Phi_k of every step, and its largest eigenvalue
     matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     tops, negative = np.array([_largest(phi) for phi in matrices]), np.array([is_negative(phi) for phi in matrices])
+    # initial condition: level^2 W - P_0 > 0
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     local = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
+    # distance from failing, free of units
     definite = np.array([smallest_eigenvalue(p) for p in P])
     margin = min(local, *(-_scaled_largest(phi) for phi in matrices))
+    # every condition that fails, in words
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
     if not local > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
@@ -93,7 +111,7 @@ def certify_level(
 
 
 def _against(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> list[str]:
-    """What the findings refute, and those that are about other constants than the system's."""
+    """Reasons against a certificate: refuted constants, and findings about constants that the system does not have."""
     reasons = []
     for finding in growth:
         if finding.refuted:
@@ -105,12 +123,12 @@ def _against(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]
 
 
 def _supports(finding: GrowthFinding, constant: float) -> bool:
-    """Whether what it is about would be enough."""
+    """Decide whether a finding about its own constant covers this one: it is no larger, but for rounding."""
     return finding.constant <= constant * (1 + TOLERANCE)
 
 
 def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
-    """The growth constants that are not zero, each once, with what each bounds."""
+    """List the growth constants that are not zero, without repetition, with the inequality of each."""
     results: dict[tuple[float, str], None] = {}
     for letter, growth in (("f", system.growth), ("h", system.output_growth)):
         for what, values in ((f"|{letter}(x)| <= a |x|", growth.state), ("", growth.error)):
@@ -120,7 +138,7 @@ def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
 
 
 def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> tuple[str, ...]:
-    """What no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
+    """List the constants that no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
     result = []
     for value, what in constants:
         about = [finding for finding in growth if _supports(finding, value)]
@@ -138,16 +156,18 @@ def theorem_matrix(
     multipliers: Float[np.ndarray, "4"],
     level: float,
 ) -> Float[np.ndarray, "q q"]:
-    """Phi of step k over (x, e, f, f~, h, h~, v, rho): the level holds over the step if it is negative definite.
+    """Matrix Phi of step k over eta = (x, e, f, f~, h, h~, v, rho): negative definite if the level holds over the step.
 
     The next (x, e) is R eta - [0; K] H V eta with H = [G, N] random, V eta = (C x + h + D v, rho) and R eta holding the
-    filter's own G-bar (C xhat + h(xhat)), so Phi needs E[H] and E[H_ab H_ij] and nothing else of the channel.
+    filter's expectation G-bar (C xhat + h(xhat)), so Phi needs E[H] and E[H_ab H_ij] and nothing else of the channel.
+    Functions that are zero throughout are left out of eta.
 
     Source: H-infinity fusion over amplify-and-forward relays, equations (8) and (18).
     """
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y, v = system.channel[k], system.states, system.output.shape[1], system.disturbance.shape[2]
     r, eye = link.disturbances, np.eye
+    # eta = (x, e, f, f~, h, h~, v, rho): where each part begins
     at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
     q = 4 * n + 2 * y + v + r
 
@@ -157,18 +177,22 @@ def theorem_matrix(
             result[:, at[name] : at[name] + block.shape[1]] = block
         return result
 
+    # V eta, E[G] (C xhat + h(xhat)) and R eta
     signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])
     expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=eye(y), d=-eye(y))  # G-bar (C xhat + h(xhat))
     values = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
+    # E |R eta - [0; K] H V eta|^2 in the norm of P_k+1
     correction = np.concatenate([np.zeros_like(gain), gain])
     inner = correction.T @ following @ correction
     cross = values.T @ following @ correction @ link.mean @ signal
     spread = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
     phi = values.T @ following @ values - cross - cross.T + spread
+    # - P_k + M'M - level^2 |(v, rho)|^2
     phi[: 2 * n, : 2 * n] -= weight
     phi[n : 2 * n, n : 2 * n] += M.T @ M
     sizes = [level**2] * (v + r)
     phi[4 * n + 2 * y :, 4 * n + 2 * y :] -= np.diag(sizes)
+    # + sum_i lambda_i (a_i^2 |argument|^2 - |value|^2): the growth conditions
     constants = [growth[k] for pair in (system.growth, system.output_growth) for growth in pair]
     for i, (constant, weight_of) in enumerate(zip(constants, multipliers, strict=True)):
         width, value_at, point_at = (n, n, y, y)[i], at["fghd"[i]], at["xexe"[i]]
@@ -181,7 +205,7 @@ def theorem_matrix(
 def _without_absent(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
-    """Leave out f and f~, or h and h~, where the function is zero throughout."""
+    """Phi without f and f~, or h and h~, where the function is zero throughout."""
     stored = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
@@ -190,7 +214,7 @@ def _without_absent(
 
 
 def _multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
-    """For f, f~, h, h~."""
+    """Multipliers of f, f~, h, h~ from 2 or 4 for each step."""
     if given.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", given.shape[1])
     return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
@@ -202,9 +226,9 @@ def _largest(phi: Float[np.ndarray, "q q"]) -> float:
 
 
 def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
-    """Whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
+    """Decide whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
 
-    Scaling keeps definiteness and lets weights of very different sizes stand in one matrix.
+    Scaling preserves definiteness and lets weights of very different sizes stand in one matrix.
     """
     return _scaled_largest(phi) < -ROUNDING
 

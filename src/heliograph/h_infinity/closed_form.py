@@ -14,11 +14,14 @@ SLACK = 1e-6  # relative strictness that a closed form gives away, so that its c
 
 
 def level_without_measurements(system: GrowthSystem) -> float:
-    """The smallest level that Theorem 1 proves for K = 0, the filter that ignores what it receives.
+    """Compute the smallest level that Theorem 1 proves for K = 0, the filter that ignores what it receives.
 
     P+ = (I / lambda + [B; B][B; B]' / level^2)^-1 with the largest lambda for which
-    P - diag(0, M'M) - lambda diag(a^2 I, a~^2 I) stays positive; the channel plays no part. It is how low a level says
-    nothing about the measurements.
+    P - diag(0, M'M) - lambda diag(a^2 I, a~^2 I) stays positive; the channel plays no part. A design is worth its
+    measurements where its level is below this one.
+
+    Args:
+        system: a system from `growth_system` whose dynamics are all in f, with growth constants above zero.
 
     Raises:
         ValueError: a system with a linear part A, or with a growth constant of zero.
@@ -41,6 +44,7 @@ def level_without_measurements(system: GrowthSystem) -> float:
 
 
 def _survives(system: GrowthSystem, scale: Float[np.ndarray, "steps _"], level: float) -> bool:
+    """Decide whether the recursion for K = 0 stays positive over the whole horizon at this level."""
     n = system.states
     weight = level**2 * system.initial_weight
     for k in range(system.steps):
@@ -54,13 +58,20 @@ def _survives(system: GrowthSystem, scale: Float[np.ndarray, "steps _"], level: 
     return True
 
 
-def known_channel_design(system: GrowthSystem, level: float, multipliers: ArrayLike | None = None) -> HInfinityDesign:
-    """The design at a level for a channel whose gains are certain: a Riccati recursion.
+def known_channel_design(
+    system: GrowthSystem, level: float, multipliers: "Float[ArrayLike, 'steps 2'] | None" = None
+) -> HInfinityDesign:
+    """Design gains at a given level for a channel whose gains are certain: a Riccati recursion.
 
     With Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and the weighted input S = diag(Q, lambda_f~, lambda_h~,
     level^2)^-1 of (e, f~, h~, v, rho), e+ = E eta - K U eta has K* = E S U' (U S U')^-1 and
-    P2+^-1 = E S E' - K* U S E', the smallest over all gains. `multipliers` (steps, 2) are those of f~ and h~; a system
-    that is all linear needs none, and then this is the H-infinity filter of textbooks.
+    P2+^-1 = E S E' - K* U S E', the smallest over all gains.
+
+    Args:
+        system: the system, from `growth_system`, whose channel has no random gain.
+        level: gamma, a positive ratio of norms.
+        multipliers: those of f~ and h~ (steps, 2), positive where the function is not zero; zeros by default, which a
+            system that is all linear needs: then this is the H-infinity filter of textbooks.
 
     Raises:
         ValueError: a channel with random gains, multipliers of the wrong shape, a level that is not positive.
@@ -81,13 +92,16 @@ def known_channel_design(system: GrowthSystem, level: float, multipliers: ArrayL
 
 def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
     n, m, steps = system.states, system.received, system.steps
+    # a little below the level, so that the certificate has a margin
     inner = level * (1 - SLACK)
     start = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
+    # P_0 = diag(state, start) as large as level^2 W allows for e, small for x
     input_size = float(np.max(np.linalg.norm(system.disturbance, 2, axis=(1, 2))))
     state = SLACK * min(start, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
     gains, weights = np.full((steps, n, m), np.nan), np.full((steps + 1, 2 * n, 2 * n), np.nan)
     weights[0] = np.diag(np.repeat([state, start], n))
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
+    # step by step: K and P2 in closed form, P1 small enough that it does no harm
     for k in range(steps):
         result = _best_gain(system, k, weights[k, n:, n:], inner, multipliers[k])
         if result is None:
@@ -107,9 +121,11 @@ def _best_gain(
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
     bounds = system.growth.error[k], system.output_growth.error[k]
+    # Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I
     reduced = weight - M.T @ M - sum(c * b**2 for c, b in zip(multipliers, bounds, strict=True)) * np.eye(n)
     if np.linalg.eigvalsh(reduced)[0] <= 0:
         return None
+    # e+ = E eta - K U eta: blocks of E, of U and of S over (e, f~, h~, v, rho)
     gain, noise = link.mean[:, :y], link.mean[:, y:]
     v, r = B.shape[1], noise.shape[1]
     parts = [(A, gain @ C, np.linalg.inv(reduced))]
@@ -121,6 +137,7 @@ def _best_gain(
     parts.append((np.zeros((n, r)), noise, np.eye(r) / level**2))
     forward, received = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
     inverse = block_diag(*(part[2] for part in parts))
+    # K* = E S U' (U S U')^-1, P2+^-1 = E S E' - K* U S E'
     cross, spread = received @ inverse @ forward.T, received @ inverse @ received.T
     best = np.linalg.lstsq(spread, cross, rcond=None)[0].T
     following = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
@@ -128,7 +145,7 @@ def _best_gain(
 
 
 def _state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
-    """The next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
+    """Next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
 
     |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do.
     """

@@ -20,14 +20,7 @@ from heliograph.h_infinity.solver import (
     check_choice,
     run_solver,
 )
-from heliograph.h_infinity.step import (
-    Layout,
-    StepMatrices,
-    Unknowns,
-    all_multipliers,
-    next_energy,
-    step_matrices,
-)
+from heliograph.h_infinity.step import Layout, StepMatrices, Unknowns, all_multipliers, next_energy, step_matrices
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.readable import readable
@@ -42,10 +35,18 @@ SCREEN = 1e-9  # strictness left in a solution, relative to the level squared, b
 class HInfinityDesign(NamedTuple):
     """Gains K with weights P_0 ... and multipliers that prove `level`.
 
-    Multipliers: 2 at each step for (f, f~) and (h, h~), or 4 for f, f~, h, h~; zero for a function that is zero.
+    Where no gains exist for the choices made, arrays are NaN from `failed_step` on.
 
-    Where no gains were found, `feasible` is false, arrays are NaN from `failed_step` on, `status` says what happened,
-    and `smallest_level` is the smallest level found to work with the same choices (None: not searched, or none found).
+    Args:
+        level: gamma, the proven bound on the ratio of norms; NaN where a search over the level failed.
+        gains: K (steps, n, m).
+        weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
+        multipliers: (steps, 2) for (f, f~) and (h, h~), or (steps, 4) for f, f~, h, h~; zero for a function that is
+            zero.
+        feasible: true if the gains prove the level over the whole horizon.
+        status: the solver's status, or what went wrong.
+        failed_step: first step without a gain; None if all have one.
+        smallest_level: smallest level that works with the same choices; None if it was not searched for, or none works.
     """
 
     level: float
@@ -61,19 +62,26 @@ class HInfinityDesign(NamedTuple):
 def recursive_design(
     system: GrowthSystem,
     level: float,
-    initial: ArrayLike | None = None,
+    initial: "Float[ArrayLike, 'n+n n+n'] | None" = None,
     objective: Objective = "trace",
     solver: Solver = "clarabel",
     separate: bool = False,
     search: bool = True,
 ) -> HInfinityDesign:
-    """Solve one linear matrix inequality after another at a given level.
+    """Design gains at a given level by one linear matrix inequality after another.
 
-    Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved: `objective` is
-    "trace" (smallest tr L; as the next, in coordinates of order one where no growth makes lengths comparable),
-    "largest_eigenvalue" (of L, and among those the smallest tr L), "log_determinant" (largest log det P) or "none"
-    (whatever the solver finds first: it often ends in a dead end). `initial` is P_0, or None for the largest allowed,
-    level^2 W. `separate` multipliers are less conservative. `search`: look for the smallest level if this one fails.
+    Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved.
+
+    Args:
+        system: the system, from `growth_system`.
+        level: gamma, a positive ratio of norms.
+        initial: P_0 (2n, 2n); the largest allowed, level^2 W, by default.
+        objective: which P_s+1 to take: "trace" the smallest tr L (this and the next in coordinates of order one where
+            no growth makes lengths comparable), "largest_eigenvalue" that of L and among those the smallest tr L,
+            "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end.
+        solver: "clarabel" (interior point) or "scs" (first order).
+        separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative.
+        search: look for the smallest level if this one fails.
 
     Raises:
         ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape.
@@ -98,11 +106,18 @@ def smallest_recursive_level(
     objective: Objective = "trace",
     solver: Solver = "clarabel",
     separate: bool = False,
-    initial: ArrayLike | None = None,
+    initial: "Float[ArrayLike, 'n+n n+n'] | None" = None,
 ) -> HInfinityDesign:
-    """The recursive design at the smallest level at which it succeeds, to 1e-4 relative (bisection).
+    """Find the smallest level at which the recursive design succeeds, to 1e-4 relative, by bisection.
 
     It is larger than the level of `horizon_design`: a recursion cannot look ahead.
+
+    Args:
+        system: the system, from `growth_system`.
+        objective: which weight to take at each step, as in `recursive_design`.
+        solver: "clarabel" or "scs".
+        separate: one multiplier for each of f, f~, h, h~ in place of two.
+        initial: P_0 (2n, 2n); the largest allowed by default.
 
     Raises:
         ValueError: an unknown objective or solver, an initial weight of the wrong shape, or no level that works.
@@ -123,16 +138,20 @@ def smallest_recursive_level(
 def horizon_design(
     system: GrowthSystem,
     separate: bool = False,
-    gains: ArrayLike | None = None,
-    initial: ArrayLike | None = None,
+    gains: "Float[ArrayLike, 'steps n m'] | None" = None,
+    initial: "Float[ArrayLike, 'n+n n+n'] | None" = None,
     solver: Solver = "clarabel",
 ) -> HInfinityDesign:
-    """The smallest level over the whole horizon, and gains that attain it: all steps as one convex problem.
+    """Find the smallest level over the whole horizon, and gains that attain it: all steps as one convex problem.
 
-    With P and Y = P2 K as unknowns in place of L and K every step is linear, and so is the level squared. `gains`
-    (steps, n, m) given: the smallest level that can be proven for those. `initial` is P_0, or None for the largest
-    allowed, level^2 W, which is never worse than another.
-    `separate`: one multiplier for each of f, f~, h, h~; never worse.
+    With P and Y = P2 K as unknowns in place of L and K every step is linear, and so is the level squared.
+
+    Args:
+        system: the system, from `growth_system`.
+        separate: one multiplier for each of f, f~, h, h~ in place of two; never worse.
+        gains: K (steps, n, m), to find the smallest level that can be proven for these; free by default.
+        initial: P_0 (2n, 2n); by default the largest allowed, level^2 W, which is never worse than another.
+        solver: "clarabel" or "scs".
 
     Raises:
         ValueError: an unknown solver, gains or an initial weight of the wrong shape.
@@ -143,16 +162,19 @@ def horizon_design(
     check_choice("solver", solver, Solver)
     n, m = system.states, system.received
     given = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
+    # coordinates of order one, and the unknowns of every step
     steps, coordinates = scale(system, step_matrices(system, separate), given)
-    local = None if given is None else np.zeros((n, m))  # beside the given ones
+    local = None if given is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [Layout(n, m, len(s.growth), local) for s in steps]
     start = None if initial is None else coordinates.scaled_weight(_weight(initial, n), 0)
     allowed = coordinates.unit**2 * coordinates.scaled_weight(system.initial_weight, 0)
+    # one convex problem in all weights, gains, multipliers and the level squared
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
     if not status.startswith("optimal") or values is None:
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
+    # the solver's answer must satisfy every step's inequality itself
     parts = [np.asarray(values[place]) for place in problem.places]
     results = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
@@ -163,6 +185,7 @@ def horizon_design(
         if not _holds(step, unknowns, fixed, SCREEN * square):
             text = f"the solver's answer fails at step {k} ({status})"
             return _empty(system, separate, float("nan"), text)._replace(failed_step=k)
+    # back to the user's units
     level = float(np.sqrt(square)) * coordinates.unit
     chosen = given
     if chosen is None:
@@ -174,7 +197,7 @@ def horizon_design(
 
 
 class _Recursion:
-    """The recursion over the horizon; a problem is compiled once and again only where the system's data change."""
+    """Recursion over the horizon, with a problem compiled once and again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
@@ -183,8 +206,9 @@ class _Recursion:
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
-        """Solve at one level, in units of the level squared."""
+        """Design at one level, in units of the level squared."""
         system, n, c = self.system, self.system.states, self.coordinates
+        # P_0 in scaled coordinates, and the initial condition
         relative = (level / c.unit) ** 2
         top = c.unit**2 * c.scaled_weight(system.initial_weight, 0)
         present = (1 - MARGIN) * top if initial is None else c.scaled_weight(initial, 0) / relative
@@ -192,6 +216,7 @@ class _Recursion:
         if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
             return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         design.weights[0] = relative * c.weight(present, 0)
+        # step by step: the inequality, then gain, weight and multipliers in the user's units
         for k, step in enumerate(self.steps):
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
@@ -217,7 +242,7 @@ class _Recursion:
 
 
 def _coupling(start: Float[np.ndarray, "w w"] | None, n: int) -> Float[np.ndarray, "w w"] | None:
-    """The weight where it couples x and e, which those of later steps do not."""
+    """Initial weight if it couples x and e, as those of later steps do not; else None."""
     return None if start is None or not np.any(start[:n, n:]) else start
 
 
@@ -226,7 +251,7 @@ def _weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def _holds(step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
-    """Whether a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
+    """Check that a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
     gain = _gain(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, spread=gain.T @ unknowns.error @ gain)
     positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0

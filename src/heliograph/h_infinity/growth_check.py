@@ -1,4 +1,4 @@
-"""Whether a function obeys a growth constant: slopes over a stated region, a pair that breaks it, or a proof."""
+"""Checks of a function's growth over a box: its largest slope, a pair that breaks it, or a proof by intervals."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from heliograph.h_infinity.slope_bound import slope_bound
+from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
 from heliograph.numerics.check import array, check_seed, fail, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
@@ -26,14 +26,25 @@ Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with 
 
 @readable
 class GrowthFinding(NamedTuple):
-    """What was found about |f(x) - f(y)| <= constant |x - y|, f(0) = 0, in the box from `low` to `high`.
+    """Evidence for or against |f(x) - f(y)| <= constant |x - y| and f(0) = 0 in a box.
 
-    slope: the largest norm of a Jacobian found there, at `point`: at least this large is every true constant; infinite
-    where f is no number. pair and ratio: the points found with the largest |f(x) - f(y)| / |x - y|. at_zero: |f(0)|.
-    bound: no slope in the box is larger, by interval arithmetic on f's own operations; None where these cannot be
-    followed, for the `reason` given. differences: false for a finding about |f(x)| <= constant |x| alone.
+    `refuted` if any evidence breaks the constant, `proved` if the bound is within it; otherwise it is assumed.
 
-    `refuted` if anything found breaks the constant, `proved` if the bound keeps it; else it is assumed.
+    Args:
+        name: the function's name in sentences.
+        constant: the growth constant a.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        slope: largest norm of a Jacobian met in the box: at least this large is every true constant; infinite where f
+            is no number.
+        point: where that slope is (n,).
+        pair: the points x, y with the largest ratio met, each (n,).
+        ratio: |f(x) - f(y)| / |x - y| of that pair.
+        at_zero: |f(0)|.
+        bound: a bound of every slope in the box by interval arithmetic on f's operations; None where these cannot be
+            followed.
+        reason: why there is no bound; empty if there is one.
+        differences: false for evidence about |f(x)| <= constant |x| alone.
     """
 
     name: str
@@ -51,28 +62,28 @@ class GrowthFinding(NamedTuple):
 
     @property
     def limit(self) -> float:
-        """The constant, with what counts as rounding."""
+        """Constant plus what counts as rounding."""
         return self.constant * (1 + TOLERANCE)
 
     @property
     def starts_at_zero(self) -> bool:
-        """Whether f(0) = 0, to rounding of what the constant allows over the box."""
+        """True if f(0) = 0, to rounding of what the constant allows over the box."""
         return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
 
     @property
     def refuted(self) -> bool:
-        """Whether a pair, a slope or f(0) breaks the constant."""
+        """True if a pair, a slope or f(0) breaks the constant."""
         steep = self.differences and not self.slope <= self.limit
         return steep or not self.ratio <= self.limit or not self.starts_at_zero
 
     @property
     def proved(self) -> bool:
-        """Whether no slope in the box exceeds the constant, for certain."""
+        """True if no slope in the box exceeds the constant, for certain."""
         return not self.refuted and self.bound is not None and self.bound <= self.limit
 
     @property
     def text(self) -> str:
-        """One line."""
+        """Verdict and evidence in one line."""
         where = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
@@ -94,14 +105,27 @@ class GrowthFinding(NamedTuple):
 
 
 def check_growth(
-    function: Function, constant: float, low: ArrayLike, high: ArrayLike, name: str = "f", seed: int = 0
+    function: Function,
+    constant: float,
+    low: "Float[ArrayLike, ' n']",
+    high: "Float[ArrayLike, ' n']",
+    name: str = "f",
+    seed: int = 0,
 ) -> GrowthFinding:
-    """Search the box from `low` to `high` (n,) for a function's largest slope, and for a pair that breaks `constant`.
+    """Search a box for a function's largest slope, and for a pair or a proof that decides on a growth constant.
 
     Norms of Jacobians by automatic differentiation at 4,096 points of a Sobol sequence, then random moves of shrinking
     size from the steepest. Pairs start close together along the steepest directions, and far apart, and move likewise.
     A box is convex, so in it the largest slope is the smallest true constant. Where f is written in operations that
     interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box.
+
+    Args:
+        function: f, from (n,) to (m,) or a number, written with jax.numpy.
+        constant: the growth constant a, not negative.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        name: the function's name in sentences; "f" by default.
+        seed: seed of the search; 0 by default.
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape or upside down.
@@ -111,8 +135,10 @@ def check_growth(
     seed = check_seed("seed", seed)
     check_callable("function", function, "the state")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    # largest slope: Sobol points, then random moves from the steepest
     starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
     points = _climb(tools.slope, starts, bottom, top, random)
+    # largest ratio: close pairs along the steepest directions, and pairs far apart
     move = tools.steepest(points) * NEARBY * tools.width / 2
     close = np.concatenate([np.clip(points - move, bottom, top), np.clip(points + move, bottom, top)], axis=1)
     far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
@@ -122,9 +148,22 @@ def check_growth(
 
 
 def check_size(
-    function: Function, constant: float, low: ArrayLike, high: ArrayLike, name: str = "f", seed: int = 0
+    function: Function,
+    constant: float,
+    low: "Float[ArrayLike, ' n']",
+    high: "Float[ArrayLike, ' n']",
+    name: str = "f",
+    seed: int = 0,
 ) -> GrowthFinding:
-    """Search the box for a point that breaks |f(x)| <= constant |x|, the weaker condition on f itself (pairs with 0).
+    """Search a box for a point that breaks |f(x)| <= constant |x|, the weaker condition on f itself (pairs with 0).
+
+    Args:
+        function: f, from (n,) to (m,) or a number, written with jax.numpy.
+        constant: the growth constant a, not negative.
+        low: lower corner of the box (n,), which has to hold 0.
+        high: upper corner of the box (n,).
+        name: the function's name in sentences; "f" by default.
+        seed: seed of the search; 0 by default.
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape, upside down or without 0.
@@ -159,7 +198,7 @@ def _check_box(
 
 
 class _Tools:
-    """Slopes and ratios of a function at many points (count, n) or pairs (count, 2n), compiled once."""
+    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once."""
 
     def __init__(self, function: Function, width: float):
         self.width, self.function = width, function
@@ -167,7 +206,7 @@ class _Tools:
         self.values = compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
-        """Norm of the Jacobian."""
+        """Norm of the Jacobian at each point; infinite where it is no number."""
         values = np.asarray(self.jacobian(points))
         finite = np.isfinite(values).all(axis=(-2, -1))
         safe = np.where(finite[:, None, None], values, 0.0)
@@ -178,7 +217,7 @@ class _Tools:
         return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
-        """|f(x) - f(y)| / |x - y|, and 0 for points too close to tell."""
+        """Ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
         apart = distance > NEARBY * self.width / 2
@@ -186,7 +225,7 @@ class _Tools:
         return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
 
     def at_zero(self, n: int) -> float:
-        """|f(0)|, infinite where it is no number."""
+        """Size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
 
@@ -201,6 +240,7 @@ def _finding(
     pairs: np.ndarray,
     differences: bool,
 ) -> GrowthFinding:
+    """Finding from the points and pairs that a search ended at, with a bound unless it is refuted."""
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
     best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[pair], 2)
@@ -232,3 +272,75 @@ def _climb(
         best = moved[np.arange(len(best)), result.argmax(axis=1)]
         size = SHRINK * size
     return best
+
+
+BOXES = 256  # looked at together
+LIMIT = 16_384  # boxes in all: what is not proven by then is left unproven
+NORM_ROUNDING = 1e-13  # relative, of the spectral norm of a small matrix
+
+
+class SlopeBound(NamedTuple):
+    """Largest norm that a Jacobian in the box can have, infinite if nothing is proven, and the reason if so."""
+
+    value: float
+    reason: str
+
+
+def slope_bound(
+    function: Callable[[jax.Array], jax.Array], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
+) -> SlopeBound:
+    """Compute a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
+
+    |J| <= |C| + |R| (spectral norms) for every J in the interval C +- R of a part's Jacobians; a function that is
+    continuous, and differentiable but for kinks, has no larger ratio than the largest of these. Continuous is one made
+    of continuous operations, with every decision the same throughout the box.
+    """
+    try:
+        with jax.enable_x64(True):
+            example = jnp.zeros((BOXES, len(low)))
+            plain = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
+            whole = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
+            evaluate(jax.make_jaxpr(plain)(example), [whole], continuous=True)
+            slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
+            return SlopeBound(_sharpened(slopes, low, high, goal), "")
+    except UnknownError as reason:
+        return SlopeBound(np.inf, f"cannot follow {reason}")
+
+
+def _sharpened(
+    slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
+) -> float:
+    bottoms, tops, done, seen = low[None], high[None], 0.0, 0
+    while len(bottoms):
+        bounds = np.concatenate(
+            [_bounds(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
+        )
+        seen += len(bottoms)
+        open_ = bounds > goal
+        done = max(done, float(np.max(bounds[~open_], initial=0.0)))
+        if seen + 2 * np.count_nonzero(open_) > LIMIT:
+            return max(done, float(np.max(bounds)))
+        bottoms, tops = _halved(bottoms[open_], tops[open_], high - low)
+    return done
+
+
+def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, " boxes"]:
+    short = BOXES - len(low)
+    ends = [np.concatenate([end, np.repeat(end[-1:], short, axis=0)]) for end in (low, high)]
+    (result,) = evaluate(slopes, [Interval(*ends)], continuous=False)
+    finite = np.isfinite(result.low) & np.isfinite(result.high)
+    a, b = np.where(finite, result.low, 0.0), np.where(finite, result.high, 0.0)
+    centre = a / 2 + b / 2
+    radius = np.nextafter(np.maximum(b - centre, centre - a), np.inf)
+    norms = sum(np.linalg.norm(part, 2, axis=(-2, -1)) for part in (centre, radius)) * (1 + NORM_ROUNDING)
+    return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
+
+
+def _halved(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every box in two, across its widest side, in shares of the whole box's."""
+    sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
+    rows = np.arange(len(low))
+    middle = (low[rows, sides] + high[rows, sides]) / 2
+    left, right = high.copy(), low.copy()
+    left[rows, sides] = right[rows, sides] = middle
+    return np.concatenate([low, right]), np.concatenate([left, high])

@@ -1,4 +1,4 @@
-"""Interval arithmetic with outward rounding on functions written in JAX: what every value in a box is certain to obey.
+"""Interval arithmetic with outward rounding on functions written in JAX: bounds that hold for every value in a box.
 
 A function is traced to its list of operations, and each is carried out on intervals [low, high] that hold every value
 that the exact operation can take; every end is moved outward by more than its rounding. An operation that is not known
@@ -34,7 +34,7 @@ class Interval(NamedTuple):
 
 
 def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
-    """The outputs' intervals. `continuous`: refuse a decision that is open, at which the function could jump.
+    """Evaluate a traced function on intervals; `continuous` refuses an open decision, at which the function could jump.
 
     Raises:
         UnknownError: an operation or a decision that cannot be followed.
@@ -44,6 +44,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     def read(atom: core.Var | core.Literal) -> Interval:
         return exact(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
+    # intervals of the arguments and constants, then of each operation's results in order
     values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
     values.update(zip(jaxpr.jaxpr.constvars, map(exact, jaxpr.consts), strict=True))
     for equation in jaxpr.jaxpr.eqns:
@@ -63,13 +64,13 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
 
 
 def exact(value: object) -> Interval:
-    """The interval that holds one value."""
+    """Interval that holds a single value."""
     array = np.asarray(value)
     return Interval(array, array)
 
 
 def outward(low: object, high: object, ulps: int = 1) -> Interval:
-    """Ends moved outward; an end that is no number is infinite."""
+    """Interval with its ends moved outward by `ulps` units in the last place; an end that is no number is infinite."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     for _ in range(ulps):
@@ -78,10 +79,13 @@ def outward(low: object, high: object, ulps: int = 1) -> Interval:
 
 
 def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
+    """Interval of an operation's result."""
     name, params = equation.primitive.name, equation.params
+    # arithmetic, and functions of a single number
     if name in ARITHMETIC:
         with np.errstate(all="ignore"):
             return ARITHMETIC[name](*x)
+    # sums, comparisons and choices, which need their parameters
     match name:
         case "integer_pow":
             return _power(x[0], params["y"])
@@ -112,13 +116,14 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
 
 
 def _decided(interval: Interval, continuous: bool) -> Interval:
+    """Interval of a decision, refused where it is open and the function has to be continuous."""
     if continuous and not np.array_equal(interval.low, interval.high):
         raise UnknownError("a decision that depends on where in the region x is")
     return interval
 
 
 def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
-    """Numbers that only change places: those of the low ends, and those of the high ones; places are whole numbers."""
+    """Intervals of numbers that only change places: move the low ends, and the high ends; places are whole numbers."""
     if any(part.low.dtype.kind in "iu" and not np.array_equal(part.low, part.high) for part in x):
         raise UnknownError("a place that depends on x")
     pairs = zip(_bound(equation, [part.low for part in x]), _bound(equation, [part.high for part in x]), strict=True)
@@ -145,7 +150,7 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 
 
 def _select(x: list[Interval]) -> Interval:
-    """cases[which], and where that is open all cases from the lowest to the highest."""
+    """Interval of cases[which]: where that is open, from the lowest of the possible cases to the highest."""
     which, cases = x[0], x[1:]
     lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
     first, last = which.low.astype(int), which.high.astype(int)
@@ -194,7 +199,7 @@ def _absolute(a: Interval) -> Interval:
 def _rising(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Of a function that never falls, with the range that its values cannot leave."""
+    """Interval version of a function that never falls, whose values stay between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
         result = outward(function(a.low), function(a.high), ULPS)
@@ -204,7 +209,7 @@ def _rising(
 
 
 def _cosine(a: Interval) -> Interval:
-    """A maximum at every even multiple of pi that is inside, a minimum at every odd one; a hair outside counts too."""
+    """Interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
     result = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
@@ -227,7 +232,7 @@ def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
 
 
 def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
-    """Products first, then their sum over what is contracted."""
+    """Interval of a contraction: products first, then their sum."""
     (left, right), (left_batch, right_batch) = dimensions
 
     def laid(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:

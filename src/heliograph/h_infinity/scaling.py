@@ -23,7 +23,7 @@ SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as
 
 
 class Coordinates(NamedTuple):
-    """S = diag(S1, S2) before every step and after the last; sizes of what is received, of growth forms, of levels."""
+    """Scales S = diag(S1, S2) before every step and after the last, of received signals, growth forms and levels."""
 
     states: Float[np.ndarray, "times w w"]
     received: Float[np.ndarray, "steps m"]
@@ -39,21 +39,21 @@ class Coordinates(NamedTuple):
         return x / max(x, e), e / max(x, e)
 
     def weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
-        """The weight P_k in the user's units."""
+        """Weight P_k in the user's units."""
         half = np.linalg.solve(self.states[k].T, scaled)
         return self.unit**2 * _symmetric(np.linalg.solve(self.states[k].T, half.T))
 
     def scaled_weight(self, weight: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
-        """And back."""
+        """Weight P_k in scaled coordinates."""
         return _symmetric(self.states[k].T @ weight @ self.states[k]) / self.unit**2
 
     def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
-        """The gain of step k in the user's units."""
+        """Gain of step k in the user's units."""
         n = len(scaled)
         return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
 
     def multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
-        """The multipliers of step k in the user's units."""
+        """Multipliers of step k in the user's units."""
         return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
 
@@ -64,16 +64,18 @@ def _symmetric(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
 def scale(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
 ) -> tuple[list[StepMatrices], Coordinates]:
-    """The steps in coordinates of order one, near the best predictor's gains or the given ones.
+    """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`.
 
     Raises:
-        ValueError: nothing is wanted.
+        ValueError: a target that is zero at every step.
     """
     n, plain = system.states, system.growth.absent and system.output_growth.absent
     initial = np.diag(1 / np.diagonal(system.initial_weight))
+    # covariances of x_0 and e_0 from the initial weight
     x, e = initial[:n, :n], initial[n:, n:]
     sizes, received, forms, scaled, target = [_sizes(x, e, plain)], [], [], [], 0.0
     nominal = steps[0].nominal
+    # covariances of (x, e) propagated with the nominal gain, and sizes from these
     for k, step in enumerate(steps):
         spread = _signals(system, k, step, x, e)
         target = max(target, float(np.trace(step.target @ spread)))
@@ -87,18 +89,19 @@ def scale(
         scaled.append(_congruent(step, unit, sizes[k + 1], received[k], forms[k], nominal))
     if target == 0:
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
+    # levels in units of the largest E |M e|^2
     level = float(_power(np.sqrt(target)))
     scaled = [s._replace(target=s.target / level**2) for s in scaled]
     return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, plain)
 
 
 def _power(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """The nearest power of 4."""
+    """Nearest power of 4."""
     return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
 
 
 def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
-    """diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
+    """Scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor(x), _factor(e)))
     return np.diag(
@@ -107,7 +110,7 @@ def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"
 
 
 def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A lower factor, of what is never disturbed with a little of its own."""
+    """Lower factor of a covariance, of a state that is never disturbed with a little variance added."""
     unit = _nonzero(np.sqrt(np.diagonal(covariance)))
     return np.asarray(
         unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
@@ -115,7 +118,7 @@ def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def _nonzero(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Components in very different units are all kept: only one without any size borrows the others'."""
+    """Powers of 4 near the sizes, however different; a component of size zero takes the smallest of the others."""
     positive = size[size > 0]
     return _power(np.where(size > 0, size, positive.min() if positive.size else 1.0))
 
@@ -152,13 +155,13 @@ def _moved(
 
 
 def _steady_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The last gain where it leaves little more than the best one, which is (K - K0) heard (K - K0)'."""
+    """Last gain where it loses little against the best, by (K - K0) R (K - K0)' with R the received covariance."""
     more = (last - best) @ received @ (last - best).T
     return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
 
 
 def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
-    """T of eta = T times what is of order one."""
+    """Scale T of eta = T times what is of order one."""
     n, y = system.states, system.output.shape[1]
     parts = [sizes]
     for growth, width in ((system.growth, n), (system.output_growth, y)):
@@ -176,6 +179,7 @@ def _congruent(
     forms: np.ndarray,
     nominal: np.ndarray,
 ) -> StepMatrices:
+    """Step in scaled coordinates, with errors about the nominal gain."""
     n = step.state.shape[0]
     return StepMatrices(
         np.linalg.solve(after[:n, :n], step.state @ unit),

@@ -1,4 +1,4 @@
-"""The semidefinite programmes of H-infinity design, written for cvxpy; the only file that imports it."""
+"""Semidefinite programmes of H-infinity design, written for cvxpy, which no other file imports."""
 
 import warnings
 from collections.abc import Callable
@@ -32,7 +32,7 @@ SCS_ITERATIONS = 100_000
 
 
 def solvers() -> ModuleType:
-    """cvxpy, or an error that says how to get it.
+    """Import cvxpy, or raise an error that says how to get it.
 
     Raises:
         ModuleNotFoundError: cvxpy is not installed.
@@ -46,13 +46,13 @@ def solvers() -> ModuleType:
 
 
 def check_choice(name: str, value: str, choices: object) -> None:
-    """Raise ValueError unless `value` is one of a Literal's choices."""
+    """Raise ValueError unless `value` is among a Literal's choices."""
     if not isinstance(value, str) or value not in get_args(choices):
         raise fail(name, f"one of {', '.join(get_args(choices))}", shown(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:
-    """Solve, and return the solver's status; a solver that gives up or is not sure of its answer is a status too."""
+    """Solve, and return the status; a solver that gives up or is not sure of its answer is a status too."""
     cp = solvers()
     solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
@@ -69,16 +69,21 @@ def run_solver(problem: "Problem", solver: Solver) -> str:
 
 
 class StepProblem:
-    """One step's inequality, compiled once: find P+, gain and multipliers for a given P, at level 1.
+    """Inequality of one step, compiled once: find P+, gain and multipliers for a given P, at level 1.
 
     Everything is divided by the level squared before it comes here, so that the level does not matter to the solver.
-    The objective picks one of the feasible P+ = L^-1: "trace" the smallest tr L, "largest_eigenvalue" that of L and
-    among those the smallest tr L, "log_determinant" the largest log det P+, "none" any. `sizes`: those of x and e where
-    S1 and S2 are numbers, so that the first two are of L in the system's own units. `start`: a weight before the step
-    that is not diag(P1, P2).
-
     A later step needs P+ as large as can be. Trace and determinant leave nothing smaller than another feasible P+; the
     largest eigenvalue alone leaves all the others open, and what a solver makes of them may end far above.
+
+    Args:
+        step: the step's matrices in scaled coordinates.
+        layout: where the unknowns stand in their vector.
+        objective: which feasible P+ = L^-1 to take: "trace" the smallest tr L, "largest_eigenvalue" that of L and among
+            those the smallest tr L, "log_determinant" the largest log det P+, "none" any.
+        solver: "clarabel" or "scs".
+        sizes: sizes of x and e where S1 and S2 are numbers, so that the first two objectives are of L in the system's
+            units.
+        start: a weight before the step that is not diag(P1, P2).
     """
 
     def __init__(
@@ -94,6 +99,7 @@ class StepProblem:
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
+        # Phi < 0 for each part of eta that is coupled, and [[Z, Y'], [Y, P2]] > 0
         forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
@@ -102,18 +108,20 @@ class StepProblem:
         for form in forms.positive:
             k = int(np.sqrt(len(form)))
             constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
+        # objectives on L, one problem after another
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
         self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
-        """The status, and a solution if there is one; fixed = S - diag(P, 0) at level 1."""
+        """Solve with fixed = S - diag(P, 0) at level 1; return the status, and a solution if there is one."""
         self.fixed.value = fixed
         first, *others = self.problems
         status = run_solver(first, self.solver)
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
+        # later objectives, held near the first one's best value
         result, best = np.asarray(self.unknowns.value), float(first.value)
         for problem in others:  # next to no room is left to them, which a solver may find too narrow
             for tie in TIES:
@@ -136,6 +144,7 @@ def _goals(
         return [(cp.Minimize(0), [])]
     if objective == "log_determinant":
         return [(cp.Maximize(sum(cp.log_det(w) for w in weights)), [])]
+    # L >= P+^-1 by a Schur complement
     eye = np.eye(weights[0].shape[0])
     inverses = [cp.Variable(w.shape, symmetric=True) for w in weights]
     above = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
@@ -148,10 +157,16 @@ def _goals(
 
 
 class HorizonProblem:
-    """All steps at once, with P_1 ... P_T+1, the gains, the multipliers and the level squared as unknowns: convex.
+    """Convex problem of all steps at once: P_1 ... P_T+1, gains, multipliers and the level squared are unknown.
 
     P_0 is the largest allowed, level^2 W up to MARGIN, unless `initial` gives it: a larger one is never worse. One
     vector holds all unknowns, so that each inequality is one sparse matrix: cvxpy then has next to nothing to do.
+
+    Args:
+        steps: matrices of every step.
+        layouts: where the unknowns of every step stand in their part of the vector.
+        weight: W (2n, 2n), the weight of the initial state in the level.
+        initial: P_0 (2n, 2n) if it is given.
     """
 
     def __init__(
@@ -163,15 +178,18 @@ class HorizonProblem:
     ):
         cp = solvers()
         self.layouts = layouts
+        # one vector: the level squared, then each step's unknowns
         sizes = [1, *(layout.size for layout in layouts)]
         self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
+        # initial condition P_0 <= level^2 W
         first = weight if initial is None else initial
         present = {0: (1 - MARGIN) * weight.ravel()[:, None]} if initial is None else {}
         if initial is not None:
             self._require({0: (1 - MARGIN) * weight.ravel()[:, None]}, -initial)
         forms: LinearForms | None = None
+        # every step's inequality, from the weight before it to its own
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
             if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
                 forms = linear_forms(step, layout)
@@ -190,8 +208,9 @@ class HorizonProblem:
         fixed: Float[np.ndarray, "w w"],
         start: Float[np.ndarray, "w w"] | None,
     ) -> None:
-        """-Phi >= MARGIN level^2, for each part of eta that stands alone; the weight before is `present` + `fixed`."""
+        """Add -Phi >= MARGIN level^2 for each part of eta that is coupled; the weight before is `present` + `fixed`."""
         q, width = len(step.energy), len(fixed)
+        # -Phi = level^2 energy - target + weight before - next energy, part by part
         constant = -step.target
         constant[:width, :width] += fixed
         for part in independent_parts(step, forms, start):
@@ -202,12 +221,13 @@ class HorizonProblem:
                 before[:width, :width] = form.reshape(width, width, -1)
                 blocks[place] = blocks.get(place, 0.0) + before.reshape(q * q, -1)[entries]
             self._require(blocks, constant[np.ix_(part, part)])
+        # positive matrices of the unknowns
         for form in forms.positive:
             size = int(np.sqrt(len(form)))
             self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size)))
 
     def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """The matrix sum_i blocks_i (unknowns in place i) + constant is positive semidefinite."""
+        """Require sum_i blocks_i (unknowns in place i) + constant to be positive semidefinite."""
         results = [(block, *np.nonzero(block), self.places[place].start) for place, block in blocks.items()]
         values = np.concatenate([block[rows, columns] for block, rows, columns, _ in results])
         rows = np.concatenate([rows for _, rows, _, _ in results])

@@ -1,11 +1,11 @@
-"""The matrix inequality of one step of an H-infinity design, linear in its unknowns.
+"""Matrix inequality of one step of an H-infinity design, linear in its unknowns.
 
 With eta = (x, e, f, f~, h, h~, v, rho) the next stacked state is x+ = X eta, e+ = (E - K U) eta - K W eta, where the
 random W has E[W'QW] = sum_j U_j'Q U_j. The level holds if, at every step,
 Phi = X'P1 X + (E - K U)'P2 (E - K U) + sum_j U_j'K'P2 K U_j + S - diag(P_s, 0) + sum_i lambda_i N_i < 0,
 S = diag(0, M'M, 0, ..., -level^2 I), eta'N_i eta >= 0 the growth conditions. With Y = P2 K and any Z >= K'P2 K it is
 linear: (E - K U)'P2 (E - K U) becomes E'P2 E - E'Y U - U'Y'E + U'Z U, and [[Z, Y'], [Y, P2]] >= 0. With K0 + K in
-place of K, and E - K0 U in place of E, no large numbers cancel where a measurement tells much. This is the Schur
+place of K, and E - K0 U in place of E, no large numbers cancel where a measurement is precise. This is the Schur
 complement of the published inequality, after a congruence, at 14 + 4 rows in place of 34 in the published example.
 """
 
@@ -20,7 +20,7 @@ from heliograph.numerics.types import Float, Int
 
 
 class StepMatrices(NamedTuple):
-    """X, E - K0 U, U, the U_j, M'M and I of S, the diagonals of the N_i, and a gain K0 near which K is searched for."""
+    """Matrices X, E - K0 U, U, U_j, M'M, I of S, diagonals of N_i, and a gain K0 near which K is searched for."""
 
     state: Float[np.ndarray, "n q"]
     error: Float[np.ndarray, "n q"]
@@ -33,7 +33,7 @@ class StepMatrices(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """P1, P2, Y = P2 (K - K0), Z >= (K - K0)'P2 (K - K0), lambda."""
+    """Unknowns P1, P2, Y = P2 (K - K0), Z >= (K - K0)'P2 (K - K0) and lambda of a step."""
 
     state: Float[np.ndarray, "n n"]
     error: Float[np.ndarray, "n n"]
@@ -43,7 +43,7 @@ class Unknowns(NamedTuple):
 
 
 def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
-    """The matrices of every step; a function that is zero throughout, as an h that is all linear, is left out of eta.
+    """Matrices of every step; a function that is zero throughout, as an h that is all linear, is left out of eta.
 
     `separate`: one multiplier for each of f, f~, h, h~ in place of one for (f, f~) and one for (h, h~).
     """
@@ -65,21 +65,26 @@ def all_multipliers(
 
 
 def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
+    """Matrices of step k."""
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
     w, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
+    # eta = (x, e, f, f~, h, h~, v, rho) without absent functions
     widths = [n, n, w, w, h, h, B.shape[1], link.disturbances]
     x, e, f, df, g, dg, v, rho = (slice(b - a, b) for a, b in zip(widths, np.cumsum(widths), strict=True))
     q, eye = sum(widths), np.eye(n)[:, :w]
+    # x+ = A x + f + B v and e+ = A e + f~ + B v before the correction
     state, error = np.zeros((n, q)), np.zeros((n, q))
     state[:, x], state[:, f], state[:, v] = A, eye, B
     error[:, e], error[:, df], error[:, v] = A, eye, B
+    # received: mean and spread of G (C . + h + D v) + N rho
     gain, noise = link.mean[:, :y], link.mean[:, y:]
     received = np.zeros((system.received, q))
     received[:, e], received[:, dg], received[:, v], received[:, rho] = gain @ C, gain[:, :h], gain @ D, noise
     varied = np.zeros((len(spreads), system.received, q))
     gain, noise = spreads[..., :y], spreads[..., y:]
     varied[..., x], varied[..., g], varied[..., v], varied[..., rho] = gain @ C, gain[..., :h], gain @ D, noise
+    # M'M, the disturbances' energy and the growth conditions as quadratic forms
     target, energy = np.zeros((q, q)), np.zeros((q, q))
     target[e, e] = M.T @ M
     energy[v, v], energy[rho, rho] = np.eye(v.stop - v.start), np.eye(rho.stop - rho.start)
@@ -100,7 +105,7 @@ def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray
 
 
 def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
-    """The quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
+    """Quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
@@ -112,7 +117,7 @@ def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q 
 
 
 class Layout(NamedTuple):
-    """How the unknowns of one step stand in one vector: the lower triangles of P1, P2 and Z, Y, and the multipliers.
+    """Layout of one step's unknowns in a vector: lower triangles of P1, P2 and Z, then Y and the multipliers.
 
     With `gain` given, Y = P2 K and Z = K'P2 K are no unknowns.
     """
@@ -130,7 +135,7 @@ class Layout(NamedTuple):
         return n * (n + 1) + free + self.multipliers
 
     def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
-        """The unknowns as matrices."""
+        """Unpack the vector into matrices."""
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
         p1, p2 = _symmetric(vector[:triangle], n), _symmetric(vector[triangle : 2 * triangle], n)
@@ -155,7 +160,7 @@ def _triangle(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "tri
 
 
 class LinearForms(NamedTuple):
-    """The inequalities of a step as linear maps of the vector of unknowns, each to a matrix written row by row.
+    """Inequalities of a step as linear maps of the vector of unknowns, each to a matrix written row by row.
 
     next: Phi's part that is linear in the unknowns. positive: matrices that must be positive. weight: diag(P1, P2).
     """
@@ -178,7 +183,7 @@ def linear_forms(step: StepMatrices, layout: Layout) -> LinearForms:
 
 
 def weight_form(layout: Layout) -> Float[np.ndarray, "ww size"]:
-    """diag(P1, P2) written row by row as a linear map of the vector of unknowns."""
+    """Linear map from the vector of unknowns to diag(P1, P2), written row by row."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T

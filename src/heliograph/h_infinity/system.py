@@ -1,4 +1,4 @@
-"""A system known by growth bounds only, seen through a channel over a finite horizon: what H-infinity designs read."""
+"""Systems known by growth bounds only, seen through a channel over a finite horizon: input of H-infinity designs."""
 
 from typing import NamedTuple
 
@@ -24,16 +24,27 @@ class Growth(NamedTuple):
 
     @property
     def absent(self) -> bool:
-        """Whether the function is zero throughout."""
+        """True if the function is zero throughout."""
         return not (np.any(self.state) or np.any(self.error))
 
 
 @readable
 class GrowthSystem(NamedTuple):
-    """x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x, and received = G y + N rho, at steps s = 0 ... steps - 1.
+    """System x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x, received = G y + N rho, at steps 0 ... steps - 1.
 
     f and h are known only by their growth, f(0) = h(0) = 0; v and rho are any sequences of finite energy; G and N are
-    random. `initial_weight` W of the stacked initial (x_0, e_0) makes the third disturbance; a channel for each step.
+    random.
+
+    Args:
+        transition: A (steps, n, n).
+        disturbance: B (steps, n, v).
+        output: C (steps, y, n).
+        feedthrough: D (steps, y, v).
+        target: M (steps, z, n), of the error that the level bounds.
+        growth: constants of f, and of its differences f~.
+        output_growth: constants of h, and of its differences h~.
+        channel: moments of (G, N), one for each step.
+        initial_weight: W (2n, 2n) of the stacked (x_0, e_0), which makes the third disturbance.
     """
 
     transition: Float[np.ndarray, "steps n n"]
@@ -58,7 +69,7 @@ class GrowthSystem(NamedTuple):
 
     @property
     def received(self) -> int:
-        """Length of what the filter receives."""
+        """Number m of components that the filter receives."""
         return int(self.channel[0].mean.shape[0])
 
 
@@ -72,20 +83,31 @@ def growth_system(
     output_growth: Varying | tuple[Varying, Varying] = 0.0,
     transition: Varying | None = None,
     output: Varying | None = None,
-    initial_weight: ArrayLike = 1.0,
+    initial_weight: "Float[ArrayLike, '...']" = 1.0,
 ) -> GrowthSystem:
     """Describe x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel, for `steps` steps.
 
-    disturbance B (n, v), feedthrough D (y, v), wanted M (z, n), transition A (n, n), output C (y, n); any may be an
-    `OverTime` of one matrix per step; A and C are zero unless given. growth, output_growth: the constant of f and of h,
-    or a pair (of f itself, of its differences) where these differ; each a number, or `OverTime` of one per step. A
-    linear h is given by `output` and growth 0. `initial_weight`: W (2n, 2n) or a multiple of the identity.
+    Each matrix may be an `OverTime` of one for every step. A linear h is given by `output` and growth 0.
+
+    Args:
+        steps: number of steps of the horizon.
+        disturbance: B (n, v).
+        feedthrough: D (y, v).
+        target: M (z, n), of the error that a level bounds.
+        channel: the channel from the sensor to the filter, or an `OverTime` of channels.
+        growth: constant of f, or a pair (of f itself, of its differences) where these differ; a number or an
+            `OverTime`.
+        output_growth: constant or constants of h in the same way; 0 by default.
+        transition: A (n, n); zero by default.
+        output: C (y, n); zero by default.
+        initial_weight: W (2n, 2n) of (x_0, e_0), or a multiple of the identity; 1 by default.
 
     Raises:
         ValueError: shapes that do not fit, negative growth, a weight that is not positive definite, things that vary
             over fewer steps than `steps`.
     """
     check_count("steps", steps)
+    # sizes n, v, y from B and D; the channel must take y outputs
     B = _over(steps, "disturbance matrix", disturbance, (None, None))
     n, v = B.shape[1:]
     D = _over(steps, "feedthrough matrix", feedthrough, (None, v))
@@ -93,6 +115,7 @@ def growth_system(
     links = _links(steps, channel)
     if links[0].inputs != y:
         raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
+    # every matrix once for each step
     return GrowthSystem(
         _over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
         B,
@@ -107,7 +130,7 @@ def growth_system(
 
 
 def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) -> Float[np.ndarray, "steps ..."]:
-    """One matrix for each step."""
+    """Matrix of every step, (steps, *shape)."""
     if not isinstance(value, OverTime):
         item: np.ndarray = array(name, value, shape)
         return np.broadcast_to(item, (steps, *item.shape))
@@ -157,7 +180,7 @@ def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """The matrix made exactly symmetric.
+    """Make a matrix exactly symmetric.
 
     Raises:
         ValueError: entries that differ across the diagonal by more than rounding of what they weigh.
@@ -170,6 +193,6 @@ def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float
 
 
 def smallest_eigenvalue(matrix: Float[np.ndarray, "w w"], units: Float[np.ndarray, "w"] | None = None) -> float:
-    """Of a symmetric matrix whose diagonal is scaled to 1 or -1, so that units do not decide its sign."""
+    """Smallest eigenvalue after scaling the diagonal to 1 or -1, so that units do not decide its sign."""
     unit = own_units(matrix) if units is None else units
     return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])

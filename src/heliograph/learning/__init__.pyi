@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .choice import (
+from .held_out import (
     Comparison as Comparison,
     compare_laws as compare_laws,
 )
@@ -16,16 +16,12 @@ from .losses.loss_law import (
     IndependentLosses as IndependentLosses,
     MarkovLosses as MarkovLosses,
 )
-from .losses.loss_tests import (
+from .losses.losses import (
     LossMemory as LossMemory,
     loss_memory as loss_memory,
-)
-from .losses.losses import (
     Losses as Losses,
     learn_losses as learn_losses,
     learn_losses_of as learn_losses_of,
-)
-from .losses.running_losses import (
     RunningRateLosses as RunningRateLosses,
 )
 from .losses.shares import (
@@ -56,4 +52,7 @@ from .description import (
 )
 from .solution import (
     Row as Row,
+)
+from .senders import (
+    SenderFit as SenderFit,
 )

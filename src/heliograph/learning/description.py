@@ -1,4 +1,4 @@
-"""The network that a function returns, built again with other numbers where some are free."""
+"""Networks with free numbers: a function that returns one, built again with other numbers where some are free."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,14 +19,24 @@ from heliograph.simulation.network import Network
 @readable
 @dataclass(frozen=True)
 class Description:
-    """A function that returns a network, and what is free in it; `named`: which names are the user's."""
+    """Network with free numbers, as the function that builds it and the numbers that are free in it.
+
+    Args:
+        build: the function, without arguments, that returns the network.
+        parameters: the free numbers in the order in which the network uses them.
+        named: which of their names the user gave.
+    """
 
     build: Build
     parameters: Parameters
     named: tuple[bool, ...]
 
     def at(self, values: Mapping[str, object]) -> Network:
-        """The network with these values."""
+        """Build the network with these values, {name: value}.
+
+        Raises:
+            ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
+        """
         with reading(Given(self.parameters, self.named, values)), jax.enable_x64(True):
             try:
                 return checked(self.build())
@@ -37,16 +47,19 @@ class Description:
 
     @cached_property
     def start(self) -> Network:
-        """The network at its starts."""
+        """Network with every free number at its start."""
         return self.at({item.name: plain_number(item.start) for item in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
-        """The network at a point of the line, of plain numbers."""
+        """Network at a point (p,) of the line, of plain numbers."""
         return self.at(self.parameters.known(x))
 
 
 def describe(network: Build) -> Description:
-    """What is free in the network that a function returns.
+    """Find what is free in the network that a function returns.
+
+    Args:
+        network: a function without arguments that returns a Network, with `hg.free(...)` in place of numbers.
 
     Raises:
         ValueError: no function, one that returns no network, or nothing free.
@@ -69,5 +82,5 @@ def describe(network: Build) -> Description:
 
 
 def checked(network: object) -> Network:
-    """What the function returned."""
+    """Check that a function returned a network, and return it."""
     return instance("network to be learned", network, Network, "a function that returns a Network")

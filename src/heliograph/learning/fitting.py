@@ -13,6 +13,7 @@ from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.recordings import gathered
 from heliograph.learning.likelihood.surface import StoppedError, Surface
+from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
 from heliograph.numerics.readable import readable
@@ -30,10 +31,14 @@ Progress = Callable[[str], None]
 @readable
 @dataclass(frozen=True)
 class Fit:
-    """What a fit found: a network that runs, a table, a covariance, and sentences.
+    """Result of a fit: a network that runs, a table of estimates with intervals, a covariance, and sentences.
 
-    `solutions` are the maxima by form, the one that counts last. `stopped`: somebody interrupted, this is the best so
-    far. `ends`: log-likelihood at which each start ended, best first.
+    Args:
+        description: the network with its free numbers.
+        solutions: maxima of the likelihood by form; the one that counts is last.
+        identified: what the data can identify.
+        ends: log-likelihood at which each start ended, best first (starts,).
+        stopped: true if the search was interrupted, so that this is the best so far.
     """
 
     description: Description
@@ -44,40 +49,43 @@ class Fit:
 
     @property
     def best(self) -> Solution:
-        """The maximum that counts: of the conditional form where there is one."""
+        """Maximum that counts: of the conditional form where there is one."""
         return self.solutions[-1]
 
     @property
     def network(self) -> Network:
-        """The network with the estimates in their places."""
+        """Network with the estimates in their places."""
         return self.description.at_point(self.best.x)
 
     @property
     def values(self) -> dict[str, float | np.ndarray]:
-        """The estimates by name."""
+        """Estimates by name."""
         return self.description.parameters.known(self.best.x)
 
     @property
     def converged(self) -> bool:
-        """Whether every form came to its maximum."""
+        """True if every form came to its maximum."""
         return all(solution.converged for solution in self.solutions)
 
     @property
     def log_likelihood(self) -> dict[str, float]:
-        """At the maximum, by form, in nats."""
+        """Log-likelihood at the maximum, by form, in nats."""
         return {solution.form: solution.total for solution in self.solutions}
 
     @property
     def table(self) -> tuple[Row, ...]:
-        """A row for each number and form, the form that counts first; intervals by `rows("cosines")`."""
+        """Row for each number and form, the form that counts first, with intervals as `rows("cosines")`."""
         return tuple(row for solution in reversed(self.solutions) for row in solution.rows())
 
     def rows(self, method: Method = "cosines", form: Form | None = None) -> tuple[Row, ...]:
-        """The table of one form with intervals by another method.
+        """Table of one form with intervals by another method.
 
-        "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as they are behind random
-        gains; "white" does not; "hessian" believes the model besides; "profile" cuts the likelihood (numbers that have
-        a coordinate of their own; the others as "hessian"); "bootstrap" draws blocks of scores.
+        Args:
+            method: "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as they are
+                behind random gains; "white" does not; "hessian" believes the model besides; "profile" cuts the
+                likelihood (numbers that have a coordinate to themselves; the others as "hessian"); "bootstrap" draws
+                blocks of scores.
+            form: "linear" or "conditional"; the one that counts unless given.
 
         Raises:
             ValueError: an unknown method, or a form that was not fitted.
@@ -91,7 +99,7 @@ class Fit:
 
     @property
     def covariance(self) -> Float[np.ndarray, "entries entries"]:
-        """Of the estimates in the order of `rows()`, by cosines; NaN for what is not told, or is at a boundary."""
+        """Covariance of the estimates in the order of `rows()`, by cosines; NaN if not identified, or at a boundary."""
         best = self.best
         inner, _ = best.covariance()
         turned = self.description.parameters.jacobian(best.x)[:, best.active]
@@ -102,11 +110,11 @@ class Fit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What there is to say: of starts, boundaries, forms that disagree, and what the data cannot tell."""
+        """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
         return (*_of_climb(self), *_of_boundaries(self.best), *_of_forms(self.solutions), *self.identified.sentences)
 
     def __str__(self) -> str:
-        """The table and the sentences."""
+        """Table and sentences as text."""
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {_number(row)}  ({row.form})" for row in self.table]
         return "\n".join([*lines, *self.sentences])
@@ -119,17 +127,24 @@ def fit(
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Fit:
+) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 
-    `network` is a function that returns a Network in which numbers are marked by `hg.free`. `recording`: what
-    `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the one node alone; a
-    `Recording`; a `Record` with all its runs; or a list of these. The likelihood is that of all nodes together. For
-    linear plants the linear form comes first, which is right whatever the laws; from there the conditional one, which
-    is sharper. `starts`: the given one, and others drawn around it with the seed. `progress` is told each step in a
-    line. Ctrl-C keeps the best so far.
+    The likelihood is that of all nodes together. For linear plants the linear form comes first, which is right whatever
+    the laws; from there the conditional one, which is sharper. Ctrl-C returns the best so far.
 
-    Shapes: inputs (steps, inputs), for each recording if they differ.
+    Behind a sender that decides when to send (`trigger` of a node) the likelihood is that of `event_filter`, silence
+    included; delta and losses are free numbers like others. A heartbeat is a whole number: fit with each that may be,
+    and compare `log_likelihood`. The result is a `SenderFit`.
+
+    Args:
+        network: a function that returns a Network in which numbers are marked by `hg.free`.
+        recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
+            one node alone; a `Recording`; a `Record` with all its runs; or a list of these.
+        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ.
+        starts: number of starts: the given one, and others drawn around it.
+        seed: seed of the starts that are drawn.
+        progress: called with a line of text at each step.
 
     Raises:
         ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit
@@ -138,12 +153,16 @@ def fit(
     """
     check_count("starts", starts)
     description = describe(network)
+    if decides(description.start):
+        return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
     data = gathered(description.start, recording, inputs, description.parameters.size)
+    # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description)]
     say: Progress = progress or (lambda line: None)
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
     stopped, ends, solutions = False, np.zeros(0), []
     identified = identified_by(surfaces[-1], points[0], seed)
+    # climb each form from the best end of the one before
     for surface in surfaces:
         result, stopped = _climbed(surface, points, say)
         order = np.argsort(-np.nan_to_num(result.total, nan=-np.inf))
@@ -156,7 +175,7 @@ def fit(
 
 
 def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
-    """The given start, and others around it at which the likelihood is finite.
+    """Starts at which the likelihood is finite: the given one, and others around it.
 
     Raises:
         ValueError: a start that is impossible, or a number on which nothing depends.
@@ -168,6 +187,7 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
         step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
+    # spread: 1.5 of a logarithm or logit, half the size of an unbounded number
     local = np.diag(first.information[0])
     spread = np.full(len(start), SPREAD)
     for entry in parameters.entries:
@@ -177,6 +197,7 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
     points: np.ndarray = start + np.concatenate(
         [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
     )
+    # starts at which the recording is impossible move halfway to the given one
     for _ in range(6):
         wrong = ~np.isfinite(surface.evaluations(points).total)
         if not wrong.any():
@@ -187,7 +208,7 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
 
 
 def _check_dependence(surface: Surface, points: np.ndarray, local: np.ndarray) -> None:
-    """Every free number matters somewhere."""
+    """Check that the likelihood depends on every free number somewhere."""
     if np.all(local > 0):
         return
     seen = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
@@ -198,7 +219,7 @@ def _check_dependence(surface: Surface, points: np.ndarray, local: np.ndarray) -
 
 
 def _climbed(surface: Surface, points: np.ndarray, say: Progress) -> tuple[Maximum, bool]:
-    """To the top, or as far as somebody let it climb."""
+    """Climb to the top, or as far as the user lets it; return the maximum and whether it was stopped."""
     form = surface.objective.form
 
     def watch(now: Maximum) -> None:
@@ -212,15 +233,17 @@ def _climbed(surface: Surface, points: np.ndarray, say: Progress) -> tuple[Maxim
 
 
 def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: Progress) -> Solution:
-    """The best of the ends, with numbers at a limit put there and the others climbed again."""
+    """Solution at the best of the ends, with numbers at a limit put there and the others climbed again."""
     x, total, active = maximum.x[lane].copy(), float(maximum.total[lane]), np.ones(maximum.x.shape[1], dtype=bool)
     converged, steps = bool(maximum.converged[lane]), maximum.steps
+    # a number that the data hardly see goes to its limit if the likelihood does not fall
     for place in _invisible(surface, x):
         moved = x.copy()
         moved[place] = np.inf if x[place] > 0 and _two_sided(surface, place) else -np.inf
         at_limit = surface.evaluations(moved[None])
         if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
             x, active[place] = moved, False
+    # climb again in the other numbers
     if not active.all():
         say(f"{surface.objective.form}: again without {int((~active).sum())} at a limit")
         try:
@@ -232,7 +255,7 @@ def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: P
 
 
 def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
-    """Coordinates of numbers with a limit that the data hardly see where they are."""
+    """List the coordinates of bounded numbers whose information is too small to tell them from the limit."""
     local = np.diag(surface.evaluations(x[None]).information[0])
     entries = surface.objective.description.parameters.entries
     return [

@@ -30,12 +30,16 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
     """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
 
     `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
-    that `hg.fit` calls. One name in several places is one number. Where it stands says what it is: a variance and a
-    scale stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain,
-    an entry of a matrix, a number in a function of your own may be any, unless `kind` says otherwise. Without a name it
-    is called after its place. Anywhere else than in a fit it is its start.
+    that `hg.fit` calls. One name in several places is one number. Its place decides its domain: a variance and a scale
+    stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain, an
+    entry of a matrix, a number in a user's function may be any, unless `kind` says otherwise. Anywhere else than in a
+    fit it is its start.
 
-    Shapes: start () or of any shape; kind "simplex" sums over the last axis.
+    Args:
+        start: value from which the search begins, () or of any shape; of kind "simplex" it sums to 1 over the last
+            axis.
+        name: name in the table of results; by default the number is called after its place.
+        kind: "real", "positive", "probability", "simplex" or "covariance"; decided by its place unless given.
 
     Raises:
         ValueError: a start that is no number, or an unknown kind.
@@ -60,7 +64,7 @@ _reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", defau
 
 @contextmanager
 def reading(reader: _Reader) -> Iterator[None]:
-    """Inside, `free` answers as this reader does."""
+    """Have `free` answer as this reader does, inside the block."""
     token = _reader.set(reader)
     try:
         yield
@@ -69,7 +73,7 @@ def reading(reader: _Reader) -> Iterator[None]:
 
 
 class _Mark:
-    """A free number while it is being asked for."""
+    """Free number while it is being collected."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
         self.start, self.given, self.place = start, name, ""
@@ -77,7 +81,7 @@ class _Mark:
         self.explicit = kind is not None
 
     def report(self, name: str, domain: Domain) -> None:
-        """A check says what it is: the narrowest holds."""
+        """Narrow the domain to what a check of the number's place requires."""
         self.place = self.place or name
         if self.explicit:
             return
@@ -90,13 +94,13 @@ class _Mark:
 
 
 class Asking:
-    """Collects what is free."""
+    """Collector of what is free."""
 
     def __init__(self) -> None:
         self.marks: list[_Mark] = []
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """The start, which learns what it is for."""
+        """Return the start, marked so that checks of its place report the domain."""
         for mark in self.marks:
             if name is not None and mark.given == name:
                 if not np.array_equal(mark.start, start):
@@ -108,7 +112,7 @@ class Asking:
         return marked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """All of them; one without a name is called after its place."""
+        """Collect all marks as parameters; one without a name is called after its place."""
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
@@ -122,14 +126,14 @@ class Asking:
 
 
 class Given:
-    """Puts values in their places: by name, and in the order of asking where no name was given."""
+    """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
         self.values = values
         self.unnamed = iter([item.name for item, single in zip(parameters.every, named, strict=True) if not single])
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """The value."""
+        """Return the value."""
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
             raise fail(

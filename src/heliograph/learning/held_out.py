@@ -1,15 +1,17 @@
-"""What learning changed for a network's filters, on rows that were not learned from."""
+"""Comparison on rows that were not learned from: networks before and after learning, and laws by likelihood."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
+from scipy.stats import norm
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.learning.choice import Comparison, compared
-from heliograph.learning.likelihood.predictive_density import predictive
+from heliograph.learning.likelihood.predictive_density import Predictive, predictive
+from heliograph.learning.long_run import mean_and_error
 from heliograph.model.over_time import OverTime, first
-from heliograph.numerics.check import InputError
+from heliograph.numerics.check import InputError, fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
@@ -22,9 +24,9 @@ LAGS = 10  # of the test for memory, with ten rows for each at least
 @readable
 @dataclass(frozen=True)
 class Expected:
-    """How well a filter expected some rows: log-likelihood of each, innovations in claimed deviations, their test.
+    """Predictions of some rows by one filter: log-likelihoods, white innovations and the test of their memory.
 
-    Shapes: log_likelihood (rows,), white (rows, received); the test is None where there are too few rows.
+    Shapes: log_likelihood (rows,), white (rows, received) in claimed deviations; the test is None for too few rows.
     """
 
     log_likelihood: Float[np.ndarray, " rows"]
@@ -33,11 +35,33 @@ class Expected:
 
 
 @readable
+class Comparison(NamedTuple):
+    """Test of whether a recording speaks for the first of two laws or for the second.
+
+    Args:
+        difference: mean of log p_a - log p_b per step, in nats.
+        standard_error: its standard error, which allows for correlation over time.
+        z: difference over standard error.
+        p_value: two-sided p-value of z.
+    """
+
+    difference: float
+    standard_error: float
+    z: float
+    p_value: float
+
+    @property
+    def decided(self) -> bool:
+        """True if the data speak for one law at 5 %, the first where the difference is positive."""
+        return self.p_value < 0.05
+
+
+@readable
 @dataclass(frozen=True)
 class Change:
-    """One filter on the held-out rows, with the numbers that the network began with and with those learned.
+    """Filter on the held-out rows, with the numbers that the network began with and with those learned.
 
-    gain: of log-likelihood per row, with its test; None where fewer than 10 rows were heard.
+    gain: of log-likelihood per row, with its test; None where fewer than 10 rows arrived.
     """
 
     node: str
@@ -65,7 +89,7 @@ class Uniformity:
 def changes(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Change]:
-    """Every filter that claims a covariance, over all rows, judged from row `cut` on."""
+    """Compare every filter that claims a covariance, run over all rows and judged from row `cut` on."""
     results = []
     for name, z in measurements.items():
         for key, old in before.nodes[name].filters.items():
@@ -83,7 +107,7 @@ def changes(
 def uniformity(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
-    """Pits of each node: by its laws where `predictive` knows its channel, else by its first filter's Gaussians."""
+    """Probability integral transforms of each node: by its laws where known, else by its first filter's Gaussians."""
     result = []
     for name, z in measurements.items():
         local, node = [change for change in outcome if change.node == name], network.nodes[name]
@@ -110,3 +134,33 @@ def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> E
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
+
+
+def compare_laws(a: Predictive, b: Predictive) -> Comparison:
+    """Test whether two laws predict one recording equally well: z of the mean difference of log-likelihoods.
+
+    Steps where nothing arrived do not count.
+
+    Args:
+        a: densities of the recording under the first law, from `predictive`.
+        b: densities of the same recording under the second.
+
+    Raises:
+        ValueError: different recordings, or fewer than 10 steps with a measurement.
+    Source: Vuong (1989); Newey and West (1987) for the standard error.
+    """
+    for name, item in (("first law", a), ("second law", b)):
+        instance(name, item, Predictive, "what `predictive` gives")
+    if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
+        raise fail("second law", "the same recording as the first", "another")
+    received = ~np.all(np.isnan(a.pit), axis=1)
+    if received.sum() < 10:
+        raise fail("recording", "at least 10 steps with a measurement", int(received.sum()))
+    return compared((a.log_likelihood - b.log_likelihood)[received])
+
+
+def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
+    """Test a mean difference (steps,) against zero."""
+    mean, error = mean_and_error(differences)
+    z = mean / error if error > 0 else 0.0
+    return Comparison(mean, error, float(z), float(2 * norm.sf(abs(z))))

@@ -1,4 +1,4 @@
-"""What a recording of a network can tell of its free numbers, before there is one and after, in words."""
+"""Identifiability of a network's free numbers, by second moments of its routes and by a recording, in words."""
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -10,16 +10,17 @@ import numpy as np
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import quantile
-from heliograph.learning.likelihood.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.objective import Data, Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
-from heliograph.learning.routes import route_sentences
+from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import factor
+from heliograph.numerics.small_matrix import congruence, contract, factor
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.moments.second_moments import second_order
 
 if TYPE_CHECKING:
     from heliograph.learning.solution import Solution
@@ -31,10 +32,15 @@ AROUND = 0.5  # how far from the start, in each coordinate
 @readable
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data tell: the names that they tell each by itself, groups that they do not tell apart, and sentences.
+    """Identifiability: names that the data identify alone, groups of which they identify combinations, and sentences.
 
-    ridges: number of directions in which the likelihood does not change. weakest: least eigenvalue of the information,
-    in units of each number's own, above nothing: small where two numbers are hard to tell apart.
+    Args:
+        parameters: the free numbers.
+        groups: groups of numbers that the data do not separate.
+        ridges: number of directions in which the likelihood does not change.
+        weakest: least eigenvalue of the information above zero, with each number in units of its standard error; small
+            where two numbers are hard to separate.
+        sentences: all this in words.
     """
 
     parameters: Parameters
@@ -45,26 +51,30 @@ class Identifiability:
 
     @property
     def identified(self) -> tuple[str, ...]:
-        """Coordinates that are told each by itself."""
+        """Coordinates that the data identify without knowledge of the others."""
         lost = {place for group in self.groups for place in group.places}
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
     def at(self, solution: "Solution") -> "Identifiability":
-        """The same with estimates and intervals of what is told."""
+        """Identifiability with estimates and intervals of what is identified."""
         return replace(self, sentences=sentences(self, solution))
 
     def __str__(self) -> str:
-        """The sentences."""
+        """Sentences, a line for each."""
         return "\n".join(self.sentences) or "All free numbers are identified."
 
 
 def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int = 400, seed: int = 0) -> Identifiability:
-    """What a recording of this network could tell of its free numbers, before there is one.
+    """Examine what a recording of this network could identify of its free numbers, before there is one.
 
     Data are drawn as the filter expects them, at three points around the start, and the information that their second
     half holds is examined: that of the first is helped by what is known of the initial state, and does not grow.
 
-    Shapes: inputs (horizon, inputs), which a plant with inputs needs.
+    Args:
+        network: a function that returns a Network in which numbers are marked by `hg.free`.
+        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs.
+        horizon: number of steps of the data, where there are no inputs; 400 by default.
+        seed: seed of the data and of the points.
 
     Raises:
         ValueError: as `fit`.
@@ -85,7 +95,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
 
 def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
-    """What a recording tells, at three points around a start."""
+    """Identifiability by a recording, at three points around a start."""
     points = _points(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
@@ -111,7 +121,7 @@ def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Ra
 
 
 def sentences(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
-    """What is not told, and what is instead."""
+    """Sentences on what is not identified, and on what is in its place."""
     names = identifiability.parameters.coordinates
     lines = [_of_group(identifiability.parameters, group, solution) for group in identifiability.groups]
     if solution is not None and any(
@@ -129,6 +139,7 @@ def sentences(identifiability: Identifiability, solution: "Solution | None") -> 
 def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
+    # products or sums that are identified, each with its interval
     left = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
         return f"Nothing in the data tells {_listed(names)}."
@@ -138,6 +149,7 @@ def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | N
     ]
     if not outputs:
         return f"The data tell only {_counted(left, 'combination')} of {_listed(names)}; {fix}."
+    # one sentence: sum, product or combination, singular or plural
     kind = "sum" if len(group.weights) else "product" if np.all(group.exponents >= 0) else "combination"
     others = f" and {_counted(left, 'other combination')}" if left else ""
     verb = "is" if len(outputs) == 1 and not left else "are"
@@ -152,7 +164,7 @@ def _counted(count: int, what: str) -> str:
 def _interval(
     parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
 ) -> str:
-    """(0.48, 95 % 0.44..0.53) of a product or a sum at a maximum."""
+    """Interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum."""
     if solution is None or not all(solution.active[i] for i in group.places):
         return ""
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
@@ -174,7 +186,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Data with the mean and covariance that the filter expects of them, Gaussian given those before."""
+    """Draw data with the mean and covariance that the filter expects of them, Gaussian given those before."""
     with jax.enable_x64(True):
         return np.asarray(_expected(objective, x, u, jax.random.key(seed)))
 
@@ -195,3 +207,48 @@ def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.A
     noise = jax.random.normal(key, (len(u), item.received), dtype=float)
     result: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
     return result
+
+
+if TYPE_CHECKING:
+    from heliograph.learning.solution import Solution
+
+KINDS = ("mean gain", "gain variance", "noise")
+
+
+def route_sentences(solution: "Solution") -> list[str]:
+    """Sentences on the identified mean gain, gain variance and noise of each output, the sensor's noise included."""
+    description = solution.surface.objective.description
+    _, sensor, channel = joint_world(description.start)
+    if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
+        return []
+
+    # mean gain, gain variance, and M R M' + spread of the constant part, of each output
+    def totals(x: Array) -> jax.Array:
+        world = joint_world(description.at(description.parameters.values(x)))
+        local, link = first(world[1]), first(world[2])
+        result, r = second_order(link), jnp.asarray(local.noise.covariance)
+        mean, p = jnp.asarray(result.mean_gain), result.mean_gain.shape[1]
+        spread = jnp.asarray(result.nominal.center)
+        whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
+        noise = jnp.diagonal(congruence(mean, r) + contract(spread, whole))
+        reached = jnp.argmax(jnp.abs(mean), axis=1)
+        rows = jnp.arange(len(mean))
+        return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)
+
+    with jax.enable_x64(True):
+        x = jnp.asarray(solution.x)
+        values, slopes = np.asarray(totals(x)), np.asarray(jax.jacfwd(totals)(x))
+    # intervals by the derivatives, for what is identified
+    covariance, freedom = solution.covariance()
+    lines = []
+    for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
+        report = [
+            f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})"
+            for kind, value, row in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True)
+            if solution.identifies(row)
+            for reach in [quantile(freedom) * float(np.sqrt(max(row @ covariance @ row, 0.0)))]
+        ]
+        if report:
+            label = name if isinstance(name, str) else f"z{name}"
+            lines.append(f"The received {label} has {', '.join(report)}, 95 %, the sensor's noise included.")
+    return lines

@@ -1,4 +1,4 @@
-"""How well a maximum is known: covariances from scores that are correlated over time, and quantiles for them."""
+"""Covariances of a maximum from scores that are correlated over time, and quantiles for intervals."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -16,7 +16,7 @@ Scores = list[Float[np.ndarray, "steps p"]]
 
 
 class LongRun(NamedTuple):
-    """The covariance of the sum of scores, and the degrees of freedom with which it is known."""
+    """Covariance of the sum of scores, and the degrees of freedom with which it is known."""
 
     covariance: Float[np.ndarray, "p p"]
     freedom: float
@@ -75,7 +75,7 @@ def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draw
 
 
 def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:
-    """By one of the methods that have a covariance."""
+    """Covariance of the sum of scores by one of the methods that have one."""
     match method:
         case "cosines":
             return cosines(scores)
@@ -87,7 +87,7 @@ def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) 
 
 
 def quantile(freedom: float) -> float:
-    """How many standard errors an interval reaches to each side."""
+    """Number of standard errors that a 95 % interval reaches to each side."""
     return float(stats.t.ppf((1 + LEVEL) / 2, freedom))
 
 

@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Float
 @readable
 @dataclass(frozen=True)
 class Parameter:
-    """A free number: its name, start, domain, and whether the user gave the name."""
+    """Free number: its name, start, domain, and the coordinates and entries that it has."""
 
     name: str
     start: Float[np.ndarray, "..."]
@@ -25,7 +25,7 @@ class Parameter:
 
     @property
     def size(self) -> int:
-        """Numbers on the line."""
+        """Count of numbers on the line."""
         return size(self.domain, self.start.shape)
 
     @property
@@ -37,16 +37,16 @@ class Parameter:
         return tuple(f"{self.name}[{','.join(map(str, at))}]" for at in places)
 
     def read(self, value: Array) -> Array:
-        """Those entries as a vector."""
+        """Vector of the entries of a value."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """The entries at a point of the line."""
+        """Entries at a point of the line."""
         with jax.enable_x64(True):
             return np.asarray(self._read_at(jnp.asarray(x)))
 
     def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Their derivatives."""
+        """Derivatives of the entries at a point of the line."""
         if self.domain.kind == "interval":
             return np.diag(unlink_slope(self.domain, x))
         with jax.enable_x64(True):
@@ -57,7 +57,7 @@ class Parameter:
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Where each entry may lie."""
+        """Domain of each entry."""
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
         if self.domain.kind == "covariance":
@@ -66,7 +66,7 @@ class Parameter:
 
 
 class Entry(NamedTuple):
-    """A number of the table: its name, where it may lie, and, if it has one of its own, its place on the line."""
+    """Number of the table: its name, its domain, and its place on the line if it is a coordinate itself."""
 
     name: str
     domain: Domain
@@ -76,13 +76,17 @@ class Entry(NamedTuple):
 @readable
 @dataclass(frozen=True)
 class Parameters:
-    """All free numbers of a network in the order in which it asks for them."""
+    """Free numbers of a network in the order in which it asks for them.
+
+    Args:
+        every: the numbers.
+    """
 
     every: tuple[Parameter, ...]
 
     @property
     def size(self) -> int:
-        """Numbers on the line."""
+        """Count of numbers on the line."""
         return sum(item.size for item in self.every)
 
     @property
@@ -92,7 +96,7 @@ class Parameters:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """The rows of the table."""
+        """Rows of the table."""
         results, begin = [], 0
         for item in self.every:
             local = item.domain.kind == "interval"
@@ -111,7 +115,7 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """The numbers at a point of the line, by name."""
+        """Numbers at a point of the line, by name."""
         ends = np.cumsum([0, *(item.size for item in self.every)])
         return {
             item.name: from_line(item.domain, item.start.shape, x[a:b])
@@ -119,7 +123,7 @@ class Parameters:
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """The same as plain numbers and arrays."""
+        """Numbers at a point of the line by name, as plain numbers and arrays."""
         with jax.enable_x64(True):
             return {name: plain_number(value) for name, value in self.values(jnp.asarray(x)).items()}
 
@@ -143,5 +147,5 @@ class Parameters:
 
 
 def plain_number(value: Array) -> float | np.ndarray:
-    """A number as a float, more of them as an array."""
+    """Convert a number to a float, several to an array."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)

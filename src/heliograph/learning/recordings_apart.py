@@ -1,4 +1,4 @@
-"""Many recordings of one network, each fitted by itself, side by side: how good estimates and intervals would be."""
+"""Fits of many recordings of one network, each without the others: how good estimates and intervals would be."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,10 +28,12 @@ SEEN = 0.05  # information of a coordinate below which the number has run to a l
 class FitEach:
     """Estimates from each of many recordings, on the line on which steps are taken.
 
-    Of each: x; the Hessian of the negative log-likelihood; the scores of each step; whether the climb converged to a
-    point at which no number has run to a limit (`inside`).
-
-    Shapes: x (runs, p), hessian (runs, p, p), scores (runs, steps, p), inside (runs,).
+    Args:
+        parameters: the free numbers.
+        x: estimates on the line (runs, p).
+        hessian: Hessian of the negative log-likelihood at each (runs, p, p).
+        scores: scores of each step (runs, steps, p).
+        inside: true if the climb converged to a point at which no number has run to a limit (runs,).
     """
 
     parameters: Parameters
@@ -42,11 +44,11 @@ class FitEach:
 
     @property
     def estimates(self) -> Float[np.ndarray, "runs p"]:
-        """The numbers themselves."""
+        """Estimates of the numbers themselves."""
         return self._back(self.x)
 
     def intervals(self, method: Method) -> tuple[Float[np.ndarray, "runs p"], Float[np.ndarray, "runs p"]]:
-        """Lower and upper ends of 95 % intervals, as `Fit.rows` makes them; NaN where a number has run to a limit."""
+        """Ends of 95 % intervals, lower and upper, as `Fit.rows` makes them; NaN where a number has run to a limit."""
         reach = np.full(self.x.shape, np.nan)
         for i in np.flatnonzero(self.inside):
             result = long_run(method, [self.scores[i]], self.hessian[i])
@@ -60,13 +62,20 @@ class FitEach:
 
 
 def fit_each(
-    network: Build, measurements: ArrayLike, inputs: ArrayLike | None = None, form: Form | None = None
+    network: Build,
+    measurements: "Float[ArrayLike, 'runs steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+    form: Form | None = None,
 ) -> FitEach:
     """Fit each of many recordings of one length by itself, from the network's start, in one compiled program.
 
-    For studies: what `fit` finds of each, without its other starts and sentences, for free numbers that are single.
+    For studies: as `fit`, without its other starts and sentences, for free numbers that are single.
 
-    Shapes: measurements (runs, steps, received) of all nodes in their order, inputs (steps, inputs) common to all.
+    Args:
+        network: a function that returns a Network in which numbers are marked by `hg.free`.
+        measurements: of all nodes in their order (runs, steps, received), NaN where one did not arrive.
+        inputs: inputs of the plant, common to all recordings (steps, inputs); a plant without inputs needs none.
+        form: "linear" or "conditional"; the last that the network allows unless given.
 
     Raises:
         ValueError: as `fit`; a form that the network has not, free numbers that are no single ones.
@@ -75,6 +84,7 @@ def fit_each(
     parameters = description.parameters
     if any(item.start.ndim for item in parameters.every):
         raise fail("free numbers", "single ones", [item.name for item in parameters.every if item.start.ndim])
+    # the form, and the data
     known: Sequence[Objective] = objectives(description)
     chosen = [item for item in known if form in (None, item.form)]
     if not chosen:
@@ -93,11 +103,13 @@ def fit_each(
         at = outcome(x)
         return np.asarray(at.density.sum(axis=1)), np.asarray(at.score.sum(axis=1)), np.asarray(at.halves.sum(axis=1))
 
+    # climb from the start in every recording
     best = maximise(evaluate, np.repeat(parameters.start[None], len(z), axis=0))
     top = outcome(best.x)
     local = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
     inside = best.converged & np.all(local > SEEN, axis=1)
     hessian = np.asarray(top.halves).sum(axis=1)
+    # Hessian by central differences of the scores; the information where it is not concave
     width = DIFFERENCE / np.sqrt(np.maximum(local, SEEN))
     slopes = np.empty(hessian.shape)
     for i in range(best.x.shape[1]):

@@ -1,4 +1,4 @@
-"""Directions in which the data say nothing: found by the information's rank, put in words, never inverted."""
+"""Directions in which the data say nothing: from the information's rank, put in words, never inverted."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,11 @@ LARGEST = 4  # exponent that is put in words
 
 
 class Confounded(NamedTuple):
-    """Free numbers of which the data tell fewer combinations than there are: their places, and what is told.
+    """Free numbers of which the data identify fewer combinations than there are numbers.
 
-    exponents: rows e of products prod_i v_i^e_i that are told; weights: rows w of sums sum_i w_i v_i that are told
-    where no product is; what is told besides is neither. `fix`: how many have to be known from elsewhere.
+    places: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
+    identified sums sum_i w_i v_i where no product is; what is identified besides is neither. fix: how many numbers have
+    to be known from elsewhere.
 
     Shapes: exponents, weights (combinations, places).
     """
@@ -29,9 +30,10 @@ class Confounded(NamedTuple):
 
 
 class Rank(NamedTuple):
-    """At one point: directions of which nothing is known (orthonormal in units of each coordinate), and the units.
+    """Rank of the information at a point: directions of which nothing is known, and those of which something is.
 
-    weakest: least eigenvalue above nothing. Shapes: flat (p, k), rest (p, p - k), unit (p,).
+    Directions are orthonormal in units of each coordinate; weakest: least eigenvalue above zero, with its direction.
+    Shapes: flat (p, k), rest (p, p - k), unit (p,).
     """
 
     flat: Float[np.ndarray, "p k"]
@@ -42,7 +44,7 @@ class Rank(NamedTuple):
 
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
-    """Of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
+    """Rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
     local = np.diag(information)
     there = local > 0
     unit = np.where(there, 1 / np.sqrt(np.where(there, local, 1.0)), 1.0)
@@ -54,7 +56,7 @@ def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
 
 
 def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]) -> list[Confounded]:
-    """Groups of coordinates that the data do not tell apart at any of the points, with what they tell."""
+    """Groups of coordinates that the data do not separate at any of the points, with what they identify."""
     count = min(rank.flat.shape[1] for rank in ranks)
     if not count:
         return []
@@ -71,7 +73,7 @@ def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ra
 
 
 def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
-    """dv/dx and d log|v|/dx of each coordinate that is a number of its own; 1 of the others."""
+    """Derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
     local, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         if entry.place is not None:
@@ -123,6 +125,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
     """Row echelon form, leading entries 1."""
     result, lead, pivot = rows.copy(), 0, 0
     for row in range(len(result)):
+        # pivot: the largest entry of the next column that has one
         while lead < result.shape[1]:
             pivot = row + int(np.argmax(np.abs(result[row:, lead])))
             if abs(result[pivot, lead]) > SAME:
@@ -130,6 +133,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
             lead += 1
         if lead == result.shape[1]:
             break
+        # swap, scale, eliminate
         result[[row, pivot]] = result[[pivot, row]]
         result[row] /= result[row, lead]
         for other in range(len(result)):
@@ -141,7 +145,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
-    """a * b^2 / c."""
+    """Text of a product: a * b^2 / c."""
     above = [_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
     below = [_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
     top = " * ".join(above) or "1"
@@ -149,7 +153,7 @@ def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> s
 
 
 def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
-    """a + 0.64 b."""
+    """Text of a sum: a + 0.64 b."""
     text = ""
     for name, weight in zip(names, weights, strict=True):
         if weight:

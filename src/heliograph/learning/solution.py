@@ -1,4 +1,4 @@
-"""The maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known."""
+"""Maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,16 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.intervals import (
-    DRAWS,
-    LEVEL,
-    Method,
-    Scores,
-    block_sums,
-    long_run,
-    quantile,
-    sandwich,
-)
+from heliograph.learning.intervals import DRAWS, LEVEL, Method, Scores, block_sums, long_run, quantile, sandwich
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.surface import REACH, Surface
 from heliograph.learning.likelihood.transforms import link, unlink
@@ -31,10 +22,17 @@ ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
 
 @readable
 class Row(NamedTuple):
-    """A free number: its estimate, its 95 % interval, and its standard error, by the form of the likelihood.
+    """Row of the table of a fit: a free number by one form of the likelihood.
 
-    boundary: the estimate is the end of where the number may lie, and the interval is from there to the other end.
-    identified: the data tell this number by itself; else the interval is NaN.
+    Args:
+        name: the number's name.
+        estimate: the estimate.
+        low: lower end of the 95 % interval; NaN if not identified.
+        high: upper end.
+        standard_error: standard error of the estimate; NaN at a boundary or if not identified.
+        form: "linear" or "conditional".
+        boundary: true if the estimate is the end of the number's domain; the interval is from there to the other end.
+        identified: true if the data identify this number without knowledge of the others.
     """
 
     name: str
@@ -49,9 +47,16 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """A maximum. `active`: which coordinates are not at a boundary. `flat`: whether ridges were found at random points.
+    """Maximum of the likelihood in one form.
 
-    Shapes: x (p,), active (p,).
+    Args:
+        surface: the likelihood.
+        x: the maximum on the line (p,).
+        total: log-likelihood there, in nats.
+        active: which coordinates are not at a boundary (p,).
+        converged: true if the climb came to a maximum.
+        steps: steps of the climb.
+        ridges: number of directions in which the likelihood does not change.
     """
 
     surface: Surface
@@ -64,17 +69,17 @@ class Solution:
 
     @property
     def form(self) -> Form:
-        """Of the likelihood."""
+        """Form of the likelihood."""
         return self.surface.objective.form
 
     @property
     def parameters(self) -> Parameters:
-        """What is free."""
+        """Free numbers."""
         return self.surface.objective.description.parameters
 
     @cached_property
     def scores(self) -> Scores:
-        """Of each step, by recording, among active coordinates."""
+        """Scores of each step, by recording, among active coordinates."""
         score = self.surface.evaluations(self.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
@@ -85,7 +90,7 @@ class Solution:
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
-        """-d2 l along the directions that are told."""
+        """Hessian of -l along the identified directions."""
         observed = self.surface.hessian(self.x, self.active)[np.ix_(self.active, self.active)]
         result = self._reduced(observed)
         if np.linalg.eigvalsh(result)[:1].sum() > 0:
@@ -95,14 +100,14 @@ class Solution:
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
-        """Those directions."""
+        """Identified directions, in columns."""
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
     def _reduced(self, matrix: np.ndarray) -> np.ndarray:
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
-        """Of the active coordinates along what is told, and degrees of freedom."""
+        """Covariance of the active coordinates along the identified directions, and degrees of freedom."""
         scores = [s @ self.basis for s in self.scores]
         if method == "bootstrap":
             drawn = np.linalg.solve(self.hessian, block_sums(scores, DRAWS, 0).T)
@@ -111,7 +116,7 @@ class Solution:
         return np.asarray(self.basis @ sandwich(self.hessian, result.covariance) @ self.basis.T), result.freedom
 
     def rows(self, method: Method = "cosines") -> tuple[Row, ...]:
-        """The table by this form."""
+        """Table by this form."""
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.x)[:, self.active]
         return tuple(
@@ -145,7 +150,7 @@ class Solution:
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _drawn(self, slopes: np.ndarray) -> np.ndarray:
-        """Ends of what blocks of scores drawn anew give, less the estimate."""
+        """Ends of an interval by blocks of scores drawn anew, less the estimate."""
         drawn = np.linalg.solve(self.hessian, block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return ends
@@ -159,7 +164,7 @@ class Solution:
         return low, high
 
     def _at_boundary(self, entry: Entry, value: float) -> Row:
-        """From the limit to where the likelihood, all others at their best, has fallen so far that 95 % are below."""
+        """Row of a number at a limit: from there to where the profile has fallen so far that 95 % are below."""
         assert entry.place is not None
         outward = -1.0 if self.x[entry.place] < 0 else 1.0
         points = np.repeat(self.x[None], 33, axis=0)
@@ -174,7 +179,7 @@ class Solution:
 
 
 def cut(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
-    """The rank of what the second half tells, with as many flat directions as there are ridges.
+    """Rank of the second half's information, with as many flat directions as there are ridges.
 
     What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
     """

@@ -1,4 +1,4 @@
-"""How many samples tell two laws of a gain apart."""
+"""Number of samples after which a likelihood ratio decides between two laws of a gain."""
 
 from typing import NamedTuple
 
@@ -16,8 +16,8 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.same import same
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -28,10 +28,10 @@ HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
 
 @readable
 class SamplesToTell(NamedTuple):
-    """How many steps the likelihood ratio needs, and what it gains in each.
+    """Number of steps that the likelihood ratio needs, and what it gains in each.
 
     samples: steps after which both errors are at most `error`; infinite where the laws look alike. information: mean
-    of log p_own - log p_other per step under the first law and under the second, nats; deviation: of that, in the long
+    of log p_true - log p_other per step under the first law and under the second, nats; deviation: of that, in the long
     run.
     """
 
@@ -49,18 +49,25 @@ def samples_to_tell(
     seed: int = 0,
     nodes: int = NODES,
 ) -> SamplesToTell:
-    """Steps of a network after which the likelihood ratio tells which of two laws a gain has, both errors `error`.
+    """Steps of a network after which the likelihood ratio decides which of two laws a gain has, both errors `error`.
 
     The gain is the network's only random one, or where it has several, those whose law equals one of the two. The
     network is simulated under each law, and `predictive` computes log p_a - log p_b. Its sum over n steps is about
     normal, with mean n I_a and variance n V_a under the first law, -n I_b and n V_b under the second; the threshold
     between them that makes both errors equal gives n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2.
 
-    Shapes: inputs (steps, inputs); their length is that of the runs, 500 steps unless given.
+    Args:
+        law_a: the first law.
+        law_b: the second law.
+        network: a network of one node that receives its sensor through a channel.
+        inputs: inputs of the plant (steps, inputs); their length is that of the runs, 500 steps unless given.
+        error: probability of either wrong decision, in (0, 0.5); 0.05 by default.
+        seed: seed of the simulation.
+        nodes: number of values that stand for each law.
 
     Raises:
-        ValueError: a network with several nodes or none that hears a channel, no gain to put the laws in, an error
-            outside (0, 0.5).
+        ValueError: a network with several nodes or none that receives through a channel, no gain to put the laws in, an
+            error outside (0, 0.5).
     """
     for name, law in (("first law", law_a), ("second law", law_b)):
         instance(name, law, AbstractLaw, "a law such as Rayleigh(1.0)")
@@ -70,6 +77,7 @@ def samples_to_tell(
         raise fail("error", "a number between 0 and 0.5", level)
     name, node = _the_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
+    # mean and long-run deviation of the ratio under each law
     channels = [_with_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     results = []
     for item, other in (channels, channels[::-1]):
@@ -77,6 +85,7 @@ def samples_to_tell(
         deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
         results.append((float(ratio.mean()), float(deviation)))
     (gain_a, deviation_a), (gain_b, deviation_b) = results
+    # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2
     gain = gain_a + gain_b
     needed = (norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
     return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
@@ -91,7 +100,7 @@ def _the_node(network: Network) -> tuple[str, Node]:
 
 
 def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
-    """The channel with `law` in the place of the gain in question."""
+    """Channel with `law` in the place of the gain in question."""
     single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     laws = [
         leaf for leaf in jax.tree.leaves(single, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)
@@ -123,7 +132,7 @@ def _ratios(
     seed: int,
     nodes: int,
 ) -> np.ndarray:
-    """log p_own - log p_other of each run and step, of data drawn under the first."""
+    """Log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the first law."""
     plain = Node(node.sensor, local, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]

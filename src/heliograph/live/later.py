@@ -44,10 +44,7 @@ class Sweep(Module):
         local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
         skip = local, {name: central[name] for name in self.network_step.filters.central}
         after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
-        return after, (
-            {kind: result["smoother_steps"][kind] for kind in self.kinds},
-            result["central_steps"],
-        )
+        return after, ({kind: result["smoother_steps"][kind] for kind in self.kinds}, result["central_steps"])
 
     def start(self, history: History, slot: jax.Array) -> PyTree:
         """Return the filters' states after a row of the history."""

@@ -14,6 +14,7 @@ from heliograph.live.history import READ, History, copied, read
 from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
+from heliograph.live.senders import SenderStatus, sender_status
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
@@ -22,6 +23,7 @@ from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
 
@@ -57,6 +59,9 @@ class Timeline:
         start: start of continuous time (default 0); must be 0 where time counts steps.
         ahead: how much later than its arrival the time of an event may be (default 0).
         capacity: greatest number of rows held (default 1000); beyond it the oldest become final.
+
+    A node with a trigger goes by steps, and that nothing came is silence: final once the step is, and before that
+    provisional, so that a late value has all steps from its own on made anew. `senders` says which is which.
 
     Raises:
         ValueError: no network, a negative window, a node called "inputs", continuous time where parts go by steps.
@@ -94,6 +99,7 @@ class Timeline:
         self._order, self._free = np.zeros(slots, dtype=np.int32), list(range(slots - 2, 0, -1))
         self._unread, self._left = list[HeldRow](), list[int]()  # final rows, and slots to free when these were read
         self._latest: list[np.ndarray] | None = None
+        self._last = np.full(len(network.names), np.nan)  # time of each node's newest final value
 
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
@@ -151,6 +157,24 @@ class Timeline:
             return self._named(self._latest)
         return self._named(self._look(now, len(self._rows.held)))
 
+    def senders(self) -> dict[str, SenderStatus]:
+        """Return the status of each node's sender that decides when to send: what its silence means by now.
+
+        Raises:
+            ValueError: no such node.
+        """
+        deciding = {n: v for n, v in self.network.nodes.items() if isinstance(v, Node) and v.trigger is not None}
+        if not deciding:
+            raise fail("senders", "a node with a trigger", list(self.network.names))
+        final, now = int(np.ceil(self.now - self.window)) - 1, int(np.floor(min(self.now, self._end())))
+        results = {}
+        for name, node in deciding.items():
+            place = self._sizes[name][0]
+            times = [row.key[0] for row in self._rows.held if any(at == place for at, _, _ in row.events)]
+            last = max([*times, self._last[place]], default=np.nan)
+            results[name] = sender_status(node, None if np.isnan(last) else int(last), final, now)
+        return results
+
     def _end(self) -> float:
         """Return the last step that the network covers."""
         return np.inf if self._horizon is None else self._horizon - 1
@@ -199,6 +223,7 @@ class Timeline:
         head = {"now": self.now, "forced": self.forced, "counts": self.counts, "of": self._player.identity}
         head |= {"dropped": self.dropped}
         head |= {"options": [self.window, self.ahead, self.capacity]}
+        held |= {"senders.last": self._last}
         return packed(head, {**row_arrays(self._rows.held), **held, **final, "final.time": time})
 
     @classmethod
@@ -219,6 +244,7 @@ class Timeline:
         """Set the state from a saved one."""
         self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
         self.dropped = head["dropped"]
+        self._last = np.array(arrays["senders.last"])
         slots, count = len(self._order), len(arrays["row.time"])
         self._history = self._player.filled(slots, saved)
         self._rows.hold(rows_from(arrays, np.asarray(saved.rows), dict(self._sizes.values())))
@@ -301,6 +327,10 @@ class Timeline:
             return
         self.forced += forced
         final, left = self._rows.drop(base)
+        for row in final:
+            for place, _, time in row.events:
+                if place >= 0:
+                    self._last[place] = time
         count = len(self._rows.held)
         self._order[:count] = self._order[base : base + count].copy()
         self._unread += [row for row in final if row.has_data()]

@@ -40,3 +40,7 @@ from .relays import (
 from .sensor import (
     AbstractSensor as AbstractSensor,
 )
+from .trigger import (
+    AbstractTrigger as AbstractTrigger,
+    SendReason as SendReason,
+)

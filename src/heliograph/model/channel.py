@@ -189,9 +189,16 @@ def mean_gain(channel: Channel) -> Channel:
     return channel.mean_gain()
 
 
-def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: int, late: bool = False) -> None:
-    """Raise ValueError unless sensor and channel fit each other and the state; `late`: delays are known here."""
+def check_link(
+    sensor: AbstractSensor, channel: AbstractRandomAffine, states: int, late: bool = False, moments: bool = True
+) -> None:
+    """Raise ValueError unless sensor and channel fit each other and the state.
+
+    `late`: delays are known here; `moments`: the noise's covariance is needed, and must exist.
+    """
     check_sensor(sensor, states)
+    if moments and not late:
+        _ = sensor.noise.covariance
     as_maps("channel", [channel])
     if channel.past and not late:
         expected = "one without delays (linear_filter knows them; hg.filters.late_filter a constant one for any filter)"

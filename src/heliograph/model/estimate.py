@@ -49,11 +49,14 @@ class Innovation(Module):
         covariance: covariance of the innovation as the filter computes it (..., m, m).
         log_likelihood: log p(components that arrived | earlier data) as the filter sees it (...), 0 when nothing
             arrived; log N(value; 0, covariance) unless the filter says otherwise.
+        weight: weight of each component in the update (..., m), from 0 (left out) to 1 (in full), of a filter that
+            weighs them; None of all others.
     """
 
     value: Float[Array, "... m"]
     covariance: Float[Array, "... m m"]
     log_likelihood: Float[Array, "..."]
+    weight: Float[Array, "... m"] | None = None
 
 
 def weakest(claims: list[Claim]) -> Claim:

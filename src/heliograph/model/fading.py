@@ -14,9 +14,18 @@ from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
+from heliograph.random_affine.modes import (
+    Faded,
+    ModeOutput,
+    Modes,
+    OneStepLate,
+    forgetful,
+    harmless,
+    joint_modes,
+    laws,
+    mixed,
+)
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, as_noise, components
 
 

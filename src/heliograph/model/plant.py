@@ -278,4 +278,7 @@ def check_shape(name: str, called: Callable[..., object], values: tuple[object, 
 
 def check_plant(plant: AnyPlant) -> Any:
     """Return the plant at its first step."""
-    return instance("plant", first(plant), AbstractPlant, "a plant")
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    if isinstance(start.noise, AbstractNoise):
+        _ = start.noise.covariance  # refused where it does not exist
+    return start

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import numpy as np
 import numpy.typing
-from jaxtyping import Bool, Float, Int, Key, PyTree
+from jaxtyping import Bool, Float, Int, Key, PyTree, Shaped
 
 Array: TypeAlias = jax.Array | np.ndarray
 if TYPE_CHECKING:
@@ -19,4 +19,4 @@ else:  # what a user gives is judged by numerics/check, in one clear line
     ArrayLike = Any
 Scalar: TypeAlias = float | Float[Array, ""]
 
-__all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Key", "PyTree", "Scalar"]
+__all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Key", "PyTree", "Scalar", "Shaped"]

@@ -15,6 +15,14 @@ from .feedback import (
     fed_back_channel as fed_back_channel,
     feedback_limit as feedback_limit,
 )
+from .messages import (
+    MessageRate as MessageRate,
+    delta_for_rate as delta_for_rate,
+    least_error as least_error,
+    prediction_error_rate as prediction_error_rate,
+    send_on_delta_rate as send_on_delta_rate,
+    simulated_rate as simulated_rate,
+)
 from .paths.networks import (
     paths_of as paths_of,
 )

@@ -37,9 +37,9 @@ class Budget(Module):
 
     def __init__(
         self,
-        total: ArrayLike | None = None,
-        per_transmitter: ArrayLike | Mapping[str, float] | None = None,
-        peak: ArrayLike | Mapping[str, float] | None = None,
+        total: "Float[ArrayLike, ''] | None" = None,
+        per_transmitter: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
+        peak: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
     ):
         self.total = None if total is None else float(scalar("total power", total, 0.0))
         self.per_transmitter = _checked("power per transmitter", per_transmitter)
@@ -80,7 +80,7 @@ class PowerLimits(NamedTuple):
     total: float
 
     def best(self, gain: Powers) -> Powers:
-        """Allowed powers q with the largest <gain, q>, zero where there is no gain: limits are nested, so a sort."""
+        """Find the allowed powers q with the largest <gain, q>, zero where no gain is: limits are nested, so a sort."""
         result, steps = np.zeros_like(gain), len(gain)
         left, mean = self.total * steps, self.mean * steps
         for flat in np.argsort(-gain, axis=None, kind="stable"):

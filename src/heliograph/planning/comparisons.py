@@ -31,7 +31,7 @@ def _silent(what: str) -> None:
 
 @readable
 class Front(NamedTuple):
-    """Errors found, and bounds below which none is, at total powers in rising order; shapes (points,).
+    """Least errors at several total powers in rising order, and bounds below which no error is; shapes (points,).
 
     No error is above that of less power: what less power reaches, more reaches too.
     """
@@ -90,8 +90,8 @@ class SiteMap(NamedTuple):
 def error_over_sites(
     best: PowerDesign,
     build: Callable[[float, float], Network],
-    x: ArrayLike,
-    y: ArrayLike,
+    x: "Float[ArrayLike, ' columns']",
+    y: "Float[ArrayLike, ' rows']",
     advance: Advance = _silent,
 ) -> SiteMap:
     """Least error at a design's total power, with its network standing elsewhere.

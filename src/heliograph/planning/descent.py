@@ -71,7 +71,7 @@ class Programme:
         self.size = max(value, 1e-12) if np.isfinite(value) else 1.0
 
     def at(self, z: Vector) -> Evaluation | None:
-        """Evaluation at a point, the last one kept."""
+        """Evaluation at a point; the last one is cached."""
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
@@ -88,7 +88,7 @@ class Programme:
         return float(now.powers.sum()) / scale, now.power_slope.sum(axis=0) * self.problem.unit / scale
 
     def room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """What is left of each limit, as a part of it; of the target last."""
+        """Remainder of each limit, as a part of it; of the target last."""
         rows, most, target, _ = self.limits
         now = self.at(z)
         if now is None:
@@ -106,7 +106,7 @@ class Programme:
         return slope if target is None else np.vstack([slope, -now.error_slope * self.problem.unit / target])
 
     def feasible(self, z: Vector) -> bool:
-        """Whether the point exists and meets the limits."""
+        """Decide whether the point exists and meets the limits."""
         return self.at(z) is not None and bool(np.all(self.room(z) >= -FEASIBLE))
 
     def merit(self, z: Vector) -> float:

@@ -43,7 +43,7 @@ class Error(Module):
 
     def __init__(
         self,
-        weight: ArrayLike | Mapping[str, float] | None = None,
+        weight: "Float[ArrayLike, 'n n'] | Mapping[str, float] | None" = None,
         worst: bool = False,
         horizon: int | None = None,
         at_end: bool = False,
@@ -121,7 +121,7 @@ class Criterion(NamedTuple):
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def supporting(self, p: Matrices) -> "Criterion":
-        """Linear function <V, P> that touches the number at p and is nowhere above it."""
+        """Linear function <V, P> that touches the number at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
         weights, root = self._by_step(p)[1], np.linalg.pinv(_root(self.weight))

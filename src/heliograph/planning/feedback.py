@@ -44,7 +44,7 @@ class FeedbackLimit(NamedTuple):
 
     @property
     def bounded(self) -> bool:
-        """Whether the error stays bounded."""
+        """True if the error stays bounded."""
         return self.noise < self.limit
 
 
@@ -57,7 +57,7 @@ class _Link(NamedTuple):
 
 
 def feedback_limit(
-    plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike
+    plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: "Float[ArrayLike, '*hop']"
 ) -> FeedbackLimit:
     """Certificate of a sensor with feedback: noise of its path, the most that keeps the error bounded, steady error.
 
@@ -92,7 +92,11 @@ def feedback_limit(
 
 
 def fed_back_channel(
-    plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike, horizon: int
+    plant: LinearPlant,
+    sensor: LinearSensor,
+    hops: Sequence[GainAndNoise],
+    powers: "Float[ArrayLike, '*hop']",
+    horizon: int,
 ) -> Channel:
     """Channel over a horizon of a sensor with feedback, in which every transmitter has a constant power.
 

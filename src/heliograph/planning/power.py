@@ -62,7 +62,7 @@ class SentPower(Module):
 
     @property
     def words(self) -> str:
-        """Whether the power stays bounded, in a line."""
+        """Sentence on whether the power stays bounded."""
         if self.growth > 1:
             return f"the plant is unstable: what is sent grows by {self.growth:.4g} a step, without limit"
         return "what is sent stays bounded" if self.growth < 1 else "what is sent is known for these steps only"
@@ -131,7 +131,7 @@ def power(
 
 
 def _at_step(channel: Channel, k: int, second: np.ndarray, horizon: int | None) -> dict[str, float]:
-    """What is sent at a step, or where there is no horizon in the long run."""
+    """Powers sent at a step, or where there is no horizon in the long run."""
     return steady_powers(at(channel, k), second) if horizon is None else sent_powers(at(channel, k), second, k)
 
 

@@ -85,12 +85,12 @@ class Certificate(NamedTuple):
 
     @property
     def gap(self) -> float:
-        """How much less may be possible at most."""
+        """Difference of the value and its bound: no more can be gained."""
         return max(self.value - self.bound, 0.0)
 
     @property
     def words(self) -> str:
-        """What the numbers certify, in a line."""
+        """Sentence on what the numbers certify."""
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         starts = "the one start" if self.starts == 1 else f"{self.starts} starts"

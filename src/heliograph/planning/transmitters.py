@@ -51,7 +51,7 @@ class Place(NamedTuple):
 
 
 def transmits(hop: Hop) -> bool:
-    """Whether anything is transmitted, rather than passed on by a wire."""
+    """Decide whether a hop transmits, rather than passes its input on by a wire."""
     return isinstance(hop, Faded) or not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
 
 
@@ -60,7 +60,7 @@ def _gain_is_one(hop: GainAndNoise) -> bool:
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
-    """Whether nothing comes through but noise: what a loss, or a mode without reception, is made of."""
+    """Decide whether a channel delivers noise alone, as a loss or a mode without reception does."""
     return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _gain_is_one(channel)
 
 
@@ -183,7 +183,7 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
 
 
 def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
-    """Which of the names are chosen, by name or by what stands before a dot.
+    """Mask of the names that are chosen, by name or by what stands before a dot.
 
     Raises:
         ValueError: a choice that is there under no name.

@@ -1,6 +1,7 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -8,14 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.check import fail, items, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
-from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.moments.moments import Moments
-from heliograph.random_affine.moments.monomials import monomials
 
 T = TypeVar("T")
 
@@ -129,6 +128,92 @@ class AbstractRandomAffine(Module):
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
+
+
+class AbstractOfOne(AbstractRandomAffine):
+    """Random affine map made of one other, with its shapes, state and extremes unless it says otherwise."""
+
+    @property
+    def inside(self) -> AbstractRandomAffine:
+        """The map that this one is made of."""
+        raise NotImplementedError
+
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of another."""
+        raise NotImplementedError
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map inside."""
+        return self.inside.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the map inside."""
+        return self.inside.inputs
+
+    @property
+    def erases(self) -> bool:
+        """True if the map inside erases."""
+        return self.inside.erases
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map inside."""
+        return self.inside.init(key)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Return the same map made of each extreme of the map inside."""
+        return tuple(self.around(m) for m in self.inside.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the map inside."""
+        return self.inside.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Return the same map made of the one inside with its mean gain."""
+        return self.around(self.inside.mean_gain())
+
+
+class AbstractWithBase(AbstractOfOne):
+    """Random affine map made of one other, its field `base`."""
+
+    base: eqx.AbstractVar[AbstractRandomAffine]
+
+    @property
+    def inside(self) -> AbstractRandomAffine:
+        """The base."""
+        return self.base
+
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map with another base."""
+        return replace(self, base=inside)
+
+
+class AbstractOfOneShape(AbstractRandomAffine):
+    """Random affine map that is at each step one of several maps of one shape."""
+
+    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    @property
+    def erases(self) -> bool:
+        """True if one of the maps erases."""
+        return any(m.erases for m in self.maps)
+
+    def check_shapes(self, name: str) -> None:
+        """Raise ValueError where the maps have several shapes."""
+        shapes = [(m.outputs, m.inputs) for m in self.maps]
+        if len(set(shapes)) != 1:
+            raise fail(name, "maps of one shape", shapes)
 
 
 def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
@@ -265,10 +350,3 @@ def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
     """z = G y + n for a drawn H."""
     return h[:-1, :-1] @ y + h[:-1, -1]
-
-
-def conditional_moments(
-    channel: AbstractRandomAffine, y: ArrayLike, order: int
-) -> Float[jax.Array | np.ndarray, " rows"]:
-    """E[mono_order(z) | y] for a given point y."""
-    return channel.moments(order).expect(monomials(array("point y", y, (channel.inputs,)), order))

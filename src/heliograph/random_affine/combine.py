@@ -16,7 +16,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library, stacked
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractOfOneShape, AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
 from heliograph.random_affine.moments.moments import Moments
 from heliograph.random_affine.moments.monomials import (
@@ -129,7 +129,7 @@ def _after(second: jax.Array, first: jax.Array) -> jax.Array:
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
 
 
-class Mixture(_Parts):
+class Mixture(AbstractOfOneShape, _Parts):
     """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
 
     Args:
@@ -149,18 +149,7 @@ class Mixture(_Parts):
     ):
         self.maps = as_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
-        if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
-            raise fail("mixture", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of each map."""
-        return self.maps[0].outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of each map."""
-        return self.maps[0].inputs
+        self.check_shapes("mixture")
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw which map, and every map."""

@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.random_affine.atoms import GainAndNoise, known
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.law import Discrete
@@ -20,7 +20,7 @@ Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain w
 T = TypeVar("T")
 
 
-class AbstractOfLine(AbstractRandomAffine):
+class AbstractOfLine(AbstractOfOne):
     """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
 
     @property
@@ -29,43 +29,21 @@ class AbstractOfLine(AbstractRandomAffine):
         raise NotImplementedError
 
     @property
-    def outputs(self) -> int:
-        """Outputs of the map."""
-        return self.line.outputs
+    def inside(self) -> AbstractRandomAffine:
+        """The map of the line."""
+        return self.line
 
-    @property
-    def inputs(self) -> int:
-        """Length of the line."""
-        return self.line.inputs
-
-    @property
-    def erases(self) -> bool:
-        """True if the map of the line erases."""
-        return self.line.erases
-
-    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the map."""
-        return self.line.init(key)
+    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return another map of the line, as late."""
+        return OfLine(inside, self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the map."""
+        """Draw the map of the line."""
         return self.line.draw(state, key)
 
     def moments(self, order: int) -> Moments:
         """Return the moments of the map of the line."""
         return self.line.moments(order)
-
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the extremes of the map of the line."""
-        return tuple(OfLine(m, self.past) for m in self.line.extremes())
-
-    def corner_count(self) -> int:
-        """Count of the map."""
-        return self.line.corner_count()
-
-    def mean_gain(self) -> AbstractRandomAffine:
-        """The map with its mean gain."""
-        return OfLine(self.line.mean_gain(), self.past)
 
 
 class OfLine(AbstractOfLine):

@@ -1,4 +1,4 @@
-"""A loss that the receiver knows of."""
+"""A loss that the receiver knows of, and the channel of complete packets, erasures removed."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,12 @@ from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.moments.moments import Moments
 
 
-class Erasure(AbstractRandomAffine):
+class Erasure(AbstractWithBase):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine
@@ -22,23 +23,9 @@ class Erasure(AbstractRandomAffine):
         self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
 
     @property
-    def outputs(self) -> int:
-        """Outputs of the map."""
-        return self.base.outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of the map."""
-        return self.base.inputs
-
-    @property
     def erases(self) -> bool:
         """Always True."""
         return True
-
-    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the map."""
-        return self.base.init(key)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw whether it arrives, and the map, whose state moves in any case."""
@@ -55,14 +42,20 @@ class Erasure(AbstractRandomAffine):
         """
         raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
 
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Erasures of the map's extremes."""
-        return tuple(Erasure(m, self.arrival) for m in self.base.extremes())
 
-    def corner_count(self) -> int:
-        """Count of the map."""
-        return self.base.corner_count()
+def arrived(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the channel given that everything arrives, where losses are independent of gains.
 
-    def mean_gain(self) -> AbstractRandomAffine:
-        """The map with its mean gain, lost as often."""
-        return Erasure(self.base.mean_gain(), self.arrival)
+    Raises:
+        ValueError: losses that depend on which of several channels was drawn.
+    """
+    if not channel.erases:
+        return channel
+    match channel:
+        case Erasure():
+            return arrived(channel.base)
+        case Series():
+            return Series([arrived(part) for part in channel.maps])
+        case Stack():
+            return Stack([arrived(part) for part in channel.maps])
+    raise fail("channel", "erasures of channels, not mixtures of them", type(channel).__name__)

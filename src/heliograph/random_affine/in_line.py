@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.numerics.check import fail
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps
 from heliograph.random_affine.combine import Mixture, Series
 from heliograph.random_affine.delay import AbstractOfLine, Delay, Delayed, of_line, sent
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
 
 
-class Held(AbstractRandomAffine):
+class Held(AbstractWithBase):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.
@@ -41,11 +41,6 @@ class Held(AbstractRandomAffine):
     def inputs(self) -> int:
         """Length of the line."""
         return self.base.inputs + self.size * self.steps
-
-    @property
-    def erases(self) -> bool:
-        """True if what the relay receives can be lost."""
-        return self.base.erases
 
     @property
     def remembers(self) -> bool:

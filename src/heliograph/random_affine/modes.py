@@ -1,4 +1,4 @@
-"""Maps whose law depends on a memory, and any combination of them as one chain with one map for each mode."""
+"""Maps whose law depends on a memory, any combination of them as one chain, and the same drawn anew at each step."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -18,7 +18,9 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import (
     AbstractModal,
+    AbstractOfOneShape,
     AbstractRandomAffine,
+    AbstractWithBase,
     as_maps,
     check_forgets,
     given,
@@ -34,7 +36,7 @@ from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 
 
-class Modes(AbstractModal):
+class Modes(AbstractOfOneShape, AbstractModal):
     """One map for each mode of a chain: at each step it is drawn from the map of the present mode.
 
     Links that name one chain are in one mode at a time; everything else in them is independent. In series, stacked,
@@ -53,25 +55,9 @@ class Modes(AbstractModal):
         self.memory, self.maps = chain, as_maps("maps of the modes", maps)
         if len(self.maps) != chain.modes:
             raise fail("maps of the modes", f"{chain.modes}, one for each mode", len(self.maps))
-        if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
-            raise fail("maps of the modes", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
+        self.check_shapes("maps of the modes")
         for m in self.maps:
             check_forgets("map of a mode", m)
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of each map."""
-        return self.maps[0].outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of each map."""
-        return self.maps[0].inputs
-
-    @property
-    def erases(self) -> bool:
-        """True if one of the maps erases."""
-        return any(m.erases for m in self.maps)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
         """Return the map of this mode; for a traced mode, one with its numbers, or a choice among kinds of maps."""
@@ -86,23 +72,11 @@ class Modes(AbstractModal):
         return result
 
 
-class _Chosen(AbstractRandomAffine):
+class _Chosen(AbstractOfOneShape):
     """One of several maps, by a traced index."""
 
     maps: tuple[AbstractRandomAffine, ...]
     index: jax.Array
-
-    @property
-    def outputs(self) -> int:
-        return self.maps[0].outputs
-
-    @property
-    def inputs(self) -> int:
-        return self.maps[0].inputs
-
-    @property
-    def erases(self) -> bool:
-        return any(m.erases for m in self.maps)
 
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
@@ -133,20 +107,10 @@ class ModeOutput(AbstractModal):
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
 
 
-class OneStepLate(AbstractRandomAffine):
+class OneStepLate(AbstractWithBase):
     """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of the map."""
-        return self.base.outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of the map."""
-        return self.base.inputs
 
     @property
     def erases(self) -> bool:
@@ -295,3 +259,66 @@ def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
         channel, is_leaf=lambda item: item is not channel and isinstance(item, AbstractRandomAffine)
     )
     return sum(degree_in(part, identity) for part in parts if isinstance(part, AbstractRandomAffine))
+
+
+ROUNDING = 1e-12  # relative: of sums over modes that cancel
+DOUBLINGS = 60  # of the steps after which the law of the modes is that of the long run
+
+
+def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """The channel with its modes drawn anew at each step, by their law in the long run; moments up to order 4 are kept.
+
+    A channel without memory is itself.
+
+    Raises:
+        ValueError: a map inside that remembers in a way of its own.
+    """
+    if not channel.remembers:
+        return channel
+    return mixed(joint_modes(channel, order=2))
+
+
+def mixed(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
+    """One of the modes' maps, by a law (that of the long run unless given)."""
+    return Mixture(modes.maps, long_run(modes) if law is None else law)
+
+
+def long_run(modes: JointModes) -> np.ndarray:
+    """p (I + Pi)^n / 2^n for a large n: the mean of the laws of all steps, of a chain that goes in circles too."""
+    rows = (np.eye(len(modes.initial)) + np.asarray(modes.transition)) / 2
+    for _ in range(DOUBLINGS):
+        rows = rows @ rows
+        rows = rows / rows.sum(axis=1, keepdims=True)
+    law: np.ndarray = np.asarray(modes.initial) @ rows
+    law = law / law.sum()
+    return law
+
+
+def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
+    """Law of the mode at each step."""
+    result = [np.asarray(steps[0].initial)]
+    for step in steps[:-1]:
+        result.append(result[-1] @ np.asarray(step.transition))
+    return result
+
+
+def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
+    """Return whether the linear filter that ignores memory is the best linear one: Cov(Hbar_k, Hbar_l) = 0 for k < l.
+
+    Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
+    steps, and lags up to the number of modes decide, since Pi^t is a combination of lower powers (Cayley-Hamilton).
+    """
+    items = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
+    if constant and not np.allclose(steps[0].initial @ steps[0].transition, steps[0].initial, rtol=0, atol=ROUNDING):
+        return False
+    means = [np.array([np.asarray(m.moments(1).mean[:-1]).ravel() for m in step.maps]) for step in steps]
+    means = means * len(items) if constant else means
+    size = max(float(np.max(np.abs(m))) for m in means) ** 2
+    starts = 1 if constant else len(items)
+    for k, law in enumerate(laws(items)[:starts]):
+        apart = law[:, None] * (means[k] - law @ means[k])
+        for item, later in zip(items[k:-1], means[k + 1 :], strict=True):
+            apart = np.asarray(item.transition).T @ apart
+            if np.max(np.abs(apart.T @ later)) > ROUNDING * size:
+                return False
+    return True

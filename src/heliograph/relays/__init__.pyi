@@ -4,8 +4,6 @@ from .design import (
     RelayDesign as RelayDesign,
     given_design as given_design,
     relay_schedules as relay_schedules,
-)
-from .own_error import (
     own_error_design as own_error_design,
 )
 from .periodic import (

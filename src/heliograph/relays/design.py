@@ -12,7 +12,7 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
+from heliograph.relays.second_moments import Propagated, initial_moments, propagate, propagate_own, step_moments
 
 GainsByFilter = Mapping[str, ArrayLike]  # by name, each (steps, n, received)
 
@@ -167,3 +167,20 @@ def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -
     result = np.zeros((len(weights), d, d))
     result[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
     return result
+
+
+_propagate_own = compiled(propagate_own)
+
+
+def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
+    """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
+
+    K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
+    what the receiver can know later (see `receiver_error_design`).
+
+    Raises:
+        ValueError: a horizon beyond what varies over time; a singular innovation moment.
+    Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    return as_design(network, _propagate_own(network.steps(horizon), start_moments(network)))

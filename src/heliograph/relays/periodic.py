@@ -49,7 +49,6 @@ def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
-    instance("network", network, RelayNetwork, "a RelayNetwork")
     result, change = _solve_own_steady(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
@@ -64,13 +63,9 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
     """
-    instance("network", network, RelayNetwork, "a RelayNetwork")
-    joined, steps = _period(network, join_gains(network, gains)), periodic_steps(network)
-    result = _steady(steps, joined)
-    radius = float(_growth(steps, joined))
-    if not radius < 1:
-        raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
-    return as_design(network, result)
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    joined = join_gains(network, gains)
+    return as_design(network, _steady(_converging_steps(network, joined), joined))
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
@@ -83,19 +78,25 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
     """
-    instance("network", network, RelayNetwork, "a RelayNetwork")
-    joined, steps = _period(network, relay_gains(network, gains)), periodic_steps(network)
-    radius = float(_growth(steps, joined))
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    joined, n = relay_gains(network, gains), len(network.states)
+    return np.asarray(_steady_behind(_converging_steps(network, joined), joined))[:, :n, :n]
+
+
+def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Steps:
+    """Steps of one period, checked for gains under which the second moments converge."""
+    check_slots(network, gains)
+    steps = periodic_steps(network)
+    radius = float(_growth(steps, gains))
     if not radius < 1:
         raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
-    n = len(network.states)
-    return np.asarray(_steady_behind(steps, joined))[:, :n, :n]
+    return steps
 
 
-def _period(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
+def check_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> None:
+    """Raise ValueError where there is not one gain for each slot."""
     if len(gains) != len(network.slots):
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
-    return gains
 
 
 def fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:

@@ -13,6 +13,7 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import GainsByFilter, RelayDesign, join_gains, split_gains
 from heliograph.relays.periodic import (
+    check_slots,
     is_covariance,
     periodic_given_design,
     periodic_own_error_design,
@@ -81,8 +82,7 @@ def _tune(
 ) -> Float[np.ndarray, "slots Fn R"]:
     """Descend over the free entries of the gains, those of each filter in units of its largest."""
     steps = periodic_steps(network)
-    if len(start) != len(network.slots):
-        raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(start))
+    check_slots(network, start)
     # Free entries: those that multiply a received number.
     used = gain_mask(steps) & (steps.live[:, None, :] > 0)
     if cost is _behind_cost:

@@ -11,15 +11,15 @@ from heliograph.model.relays import Steps
 from heliograph.numerics.check import fail, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.relays.descent import lbfgs
-from heliograph.relays.second_moments import gain_mask, propagate, step_moments
-from heliograph.relays.step_gain import normal_matrix, pull_back
+from heliograph.relays.descent import bfgs
+from heliograph.relays.second_moments import gain_mask, normal_matrix, propagate, pull_back, step_moments
 
 POWER_TOLERANCE = 1e-6  # relative excess over a limit that counts as met
 BARRIERS = np.geomspace(1e-1, 1e-4, 32)  # of the cost at the start, for all steps together
 ROOM = 0.1  # part of each limit that the first gains leave free
 HALVINGS = 30
 DAMPING = 1e-6  # relative, of the normal matrices that scale the gains
+MEMORY = 30  # updates that stand for the inverse Hessian of all steps' gains
 PRECISION = 1e-8  # of the cost at the start: five iterations in a row that gain less end a descent
 
 
@@ -94,7 +94,7 @@ def best_within(
         gains = results[-1]
         units = np.asarray(_units(problem, gains, barrier))
         function = partial(_descended, problem, gains, units, barrier)
-        x = lbfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION)
+        x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
         results.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
     judged = [_judge(problem, gains) for gains in results]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]

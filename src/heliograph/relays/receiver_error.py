@@ -14,14 +14,13 @@ from heliograph.relays.design import (
     RelayDesign,
     given_design,
     join_gains,
+    own_error_design,
     receiver_weight,
     split_gains,
     start_moments,
 )
-from heliograph.relays.own_error import own_error_design
 from heliograph.relays.power_limit import Limited, best_within, power_limit_of
-from heliograph.relays.second_moments import correct, propagate, step_moments
-from heliograph.relays.step_gain import best_gain, pull_back
+from heliograph.relays.second_moments import best_gain, correct, propagate, pull_back, step_moments
 
 STEPS = 4  # of a descent within a power limit, for each sweep
 

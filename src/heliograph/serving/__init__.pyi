@@ -20,18 +20,20 @@ from .output import (
     Refused as Refused,
     FilterOutput as FilterOutput,
 )
-from .storage.in_memory_store import (
+from .storage.store_protocol import (
     InMemoryStore as InMemoryStore,
+    identity as identity,
 )
 from .storage.store import (
     Store as Store,
 )
-from .storage.identity import (
-    identity as identity,
-)
 from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
+    connected as connected,
+    Part as Part,
+    part_of as part_of,
+    word as word,
 )
 from .brokers.pipe import (
     Pipe as Pipe,
@@ -39,14 +41,6 @@ from .brokers.pipe import (
 from .brokers.url import (
     Address as Address,
     address as address,
-)
-from .brokers.broker import (
-    connected as connected,
-)
-from .brokers.partition import (
-    Part as Part,
-    part_of as part_of,
-    word as word,
 )
 from .loop import (
     keep_running as keep_running,

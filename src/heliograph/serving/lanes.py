@@ -18,11 +18,44 @@ from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.types import Float, PyTree
-from heliograph.serving.flat import Flat, flat_like, row_of
 from heliograph.simulation.judging import implausible
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.stepping import AllFilters
+
+
+class Flat(NamedTuple):
+    """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
+
+    structure: jax.tree_util.PyTreeDef
+    shapes: tuple[tuple[int, ...], ...]
+    kinds: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of a row."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    def tree(self, row: jax.Array | np.ndarray) -> PyTree:
+        """Restore the tree from a row, with the shapes and dtypes of the original leaves."""
+        parts, begin = [], 0
+        for shape, kind in zip(self.shapes, self.kinds, strict=True):
+            end = begin + int(np.prod(shape))
+            parts.append(row[begin:end].reshape(shape).astype(kind))
+            begin = end
+        return self.structure.unflatten(parts)
+
+
+def flat_like(tree: PyTree) -> Flat:
+    """Return the layout of a tree of arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
+
+
+def row_of(tree: PyTree) -> jax.Array:
+    """Concatenate the leaves of a tree of arrays in a row of doubles."""
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])
+
 
 TOGETHER = 16  # lanes of one turn of the loop: they fill the vectors of a processor
 WIDTH = 512  # lanes of one call

@@ -47,6 +47,26 @@ class FilterOutput(BaseModel):
     implausible: str = Field("", description="Why this filter alone did not use what was received, where it did not.")
 
 
+class SenderOutput(BaseModel):
+    """Status of a sender that decides when to send, by the time of the newest arrival.
+
+    Args:
+        last: step of its newest value; null before the first.
+        silent: steps since then that are final, at which it sent nothing or what it sent was lost.
+        provisional: later steps at which nothing came yet.
+        missed: heartbeats that were due in the silent steps and did not come.
+        chance: probability that the link lost all of these.
+        dead: true where that is below 1 in 1,000: the value is unknown then, not constant.
+    """
+
+    last: int | None
+    silent: int
+    provisional: int
+    missed: int
+    chance: float
+    dead: bool
+
+
 class Estimates(BaseModel):
     """Estimates of a plant's filters after the row at `time`, by node and filter; fused ones under "fused".
 
@@ -56,6 +76,7 @@ class Estimates(BaseModel):
         plant: name of the plant.
         time: time of the row: steps, seconds or an ISO 8601 date.
         estimates: the filters' estimates by node and filter.
+        senders: of provisional ones, senders that decide when to send, by node; left out where there are none.
     """
 
     id: int | None = Field(
@@ -65,6 +86,7 @@ class Estimates(BaseModel):
     plant: str
     time: float | str
     estimates: dict[str, dict[str, FilterOutput]]
+    senders: dict[str, SenderOutput] = Field({}, description="Of provisional ones: senders that decide when to send.")
 
 
 class Refused(BaseModel):

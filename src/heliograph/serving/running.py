@@ -11,18 +11,15 @@ from pathlib import Path
 from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.brokers.broker import connected
-from heliograph.serving.brokers.partition import Part
 from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.transport import Part, connected
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.in_memory_store import InMemoryStore
-from heliograph.serving.storage.store_protocol import Damage, StoreProtocol
+from heliograph.serving.storage.store_protocol import Damage, InMemoryStore, StoreProtocol, identity
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing

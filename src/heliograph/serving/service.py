@@ -1,23 +1,70 @@
-"""A service: batches of messages in, outputs to publish out; its whole state is committed in between."""
+"""A service: batches of messages in, lines of JSON to publish out; its whole state is committed in between."""
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
+from math import isfinite
 from time import perf_counter
 from typing import NamedTuple
 
+from pydantic_core import to_json
+
+from heliograph.filters.plausibility import in_words
 from heliograph.live.event import Verdict
+from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
-from heliograph.serving.json_lines import Teller, line
+from heliograph.serving.lanes import Lanes, Place
 from heliograph.serving.message import Message, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
 from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
+
+
+class Teller:
+    """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
+
+    def __init__(self, lanes: Lanes):
+        self._n = len(lanes.network.states)
+        self._nodes: dict[str, list[Place]] = {}
+        for place in lanes.places:
+            self._nodes.setdefault(place.node, []).append(place)
+
+    def estimates(
+        self, kind: str, plant: str, time: float | str, outputs: list[float], senders: Mapping[str, SenderStatus]
+    ) -> bytes:
+        """Return a line with the estimates of all filters after a row, from its outputs, and the senders."""
+        results = {
+            node: {place.filter: self._filter(place, outputs) for place in places}
+            for node, places in self._nodes.items()
+        }
+        parts: dict[str, object] = {"kind": kind, "plant": plant, "time": time, "estimates": results}
+        if senders:
+            parts["senders"] = {name: status._asdict() | {"dead": status.dead} for name, status in senders.items()}
+        return line(parts)
+
+    def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
+        n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
+        covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
+        numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
+        claim = place.claim if numbers else "none"
+        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        if judged is None:
+            return results
+        if outputs[judged.reason] > 0:
+            why = in_words(outputs[judged.reason], outputs[judged.distance])
+            return results | {"nis": None, "received": 0, "implausible": why}
+        return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
+
+
+def line(parts: dict[str, object]) -> bytes:
+    """Encode a value as one line of JSON, without the newline."""
+    return to_json(parts, inf_nan_mode="null")
+
 
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
 WHY: dict[Verdict, str] = {
@@ -91,6 +138,14 @@ class Service:
         lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
         self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
+
+    def dead_senders(self) -> dict[str, int]:
+        """Count the plants in memory that have a dead sender, by node whose sender decides when to send."""
+        dead = dict.fromkeys(self.fleet.deciding, 0)
+        for plant in self.plants.values() if dead else ():
+            for node, status in self.fleet.senders(plant).items():
+                dead[node] += status.dead
+        return dead
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
@@ -206,7 +261,8 @@ class Service:
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
-        return self._teller.estimates(kind, plant.name, moment, outputs)
+        senders = self.fleet.senders(plant) if kind == "provisional" else {}
+        return self._teller.estimates(kind, plant.name, moment, outputs, senders)
 
 
 @contextmanager

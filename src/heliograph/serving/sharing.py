@@ -6,8 +6,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Protocol
 
-from heliograph.serving.brokers.retry import LOG
-from heliograph.serving.brokers.transport import TakenOverError
+from heliograph.serving.brokers.transport import LOG, TakenOverError
 from heliograph.serving.loop import signals
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]

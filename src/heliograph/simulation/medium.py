@@ -9,6 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
@@ -16,10 +19,11 @@ from heliograph.model.over_time import OverTime, at, first, over_time, stack, st
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module
 from heliograph.random_affine.base import anonymous
-from heliograph.simulation.draws import SENSOR, checksum, draw_key
+from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.shared_fading import deliver, memory_places, start
@@ -44,11 +48,17 @@ class AbstractMedium(Module):
         """Feed the filters' estimates back after their step, by kind, (filter, node, ...)."""
         return state
 
+    def reasons(self, state: PyTree) -> dict[str, jax.Array]:
+        """Return the reasons for which senders that decide transmitted at this step, by group; none here."""
+        return {}
+
 
 class NodeGroup(Module):
     """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
     `teller`: the filters that are fed back to the sensors, whose estimates stand at `place` (kind, filter) among all.
+
+    `trigger`: when they send; its prediction is that of a filter too, the `teller`.
 
     Shapes: checksums (node,), memories (node, memories of a channel): checksums of the channels' memories.
     """
@@ -57,15 +67,17 @@ class NodeGroup(Module):
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
-    teller: FedBackFilter | None
+    teller: FedBackFilter | EventFilter | StochasticEventFilter | None
+    trigger: AbstractTrigger | None
     place: tuple[int, int] | None = eqx.field(static=True)
 
 
 class LinkState(NamedTuple):
-    """State of a channel, and the estimate (n,) last fed back to its sensor; None without feedback."""
+    """State of a channel, of its sender, and the estimate (n,) last fed back to the sensor, each None without."""
 
     memory: PyTree
     feed_back: jax.Array | None
+    sender: Sender | None = None
 
 
 class SeparateChannels(AbstractMedium):
@@ -77,8 +89,10 @@ class SeparateChannels(AbstractMedium):
         """Return states of the channels and of the feedback, by group, with a leading node axis."""
 
         def single(group: NodeGroup) -> LinkState:
-            feed_back = None if group.teller is None else jnp.asarray(group.teller.init().mean)
-            return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back)
+            feed_back = None if group.teller is None else _first_mean(group.teller)
+            outputs = len(first(group.sensor).outputs)
+            sender = None if group.trigger is None else group.trigger.start(outputs)
+            return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
 
         return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
 
@@ -90,10 +104,18 @@ class SeparateChannels(AbstractMedium):
         def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
             sensor = at(group.sensor, k)
             y = sensed(sensor, x, draw_key(key, k, group.checksums, SENSOR))
-            if group.teller is not None and reach.feed_back is not None:
+            if isinstance(group.teller, FedBackFilter) and reach.feed_back is not None:
                 y = y - group.teller.reference(reach.feed_back, u, k)
             memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
-            return LinkState(memory, reach.feed_back), z
+            if group.trigger is None or reach.sender is None:
+                return LinkState(memory, reach.feed_back), z
+            # The sender decides, by its own reference.
+            sender = reach.sender
+            if group.trigger.reference == "prediction" and group.teller is not None and reach.feed_back is not None:
+                sender = sender._replace(reference=group.teller.reference(reach.feed_back, u, k))
+            drawn = draw_key(key, k, group.checksums, TRIGGER)
+            sender, z = group.trigger.transmit(sender, y, z, drawn, k)
+            return LinkState(memory, reach.feed_back, sender), z
 
         both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0))
         results = [both(group, reach) for group, reach in zip(self.groups, state, strict=True)]
@@ -102,9 +124,17 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Feed the present estimate of each filter back to its sensor."""
         return tuple(
-            reach if group.place is None else LinkState(reach.memory, estimates[group.place[0]].mean[group.place[1]])
+            reach if group.place is None else reach._replace(feed_back=estimates[group.place[0]].mean[group.place[1]])
             for group, reach in zip(self.groups, state, strict=True)
         )
+
+    def reasons(self, state: PyTree) -> dict[str, jax.Array]:
+        """Return the reasons for which senders that decide transmitted at this step, by group, (node, m)."""
+        return {str(g): reach.sender.last for g, reach in enumerate(state) if reach.sender is not None}
+
+
+def _first_mean(item: AbstractFilter) -> jax.Array:
+    return jnp.asarray(item.estimate(item.init()).mean)
 
 
 def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
@@ -263,10 +293,12 @@ def medium_of(network: Network) -> AbstractMedium:
         parts = stack([(local[name].sensor, _unnamed(local[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])
-        informed_by = local[names[0]].informed_by
+        informed_by = local[names[0]].informed_by or local[names[0]].predictor
         teller: PyTree = None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
         place = None if informed_by is None else places[names[0], informed_by][:2]
-        groups.append(NodeGroup(*parts, checksums, held, teller, place))
+        triggers: PyTree = [local[name].trigger for name in names]
+        trigger = None if triggers[0] is None else stack(triggers)
+        groups.append(NodeGroup(*parts, checksums, held, teller, trigger, place))
     return SeparateChannels(tuple(groups))
 
 

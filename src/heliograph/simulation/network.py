@@ -27,7 +27,16 @@ from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.description.diagram import short_text_of, table_of
 from heliograph.simulation.flags import check_flags
-from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
+from heliograph.simulation.node import (
+    Common,
+    Listener,
+    Node,
+    check_filters,
+    check_received,
+    check_sizes,
+    check_type,
+    lowered_claim,
+)
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
@@ -258,9 +267,13 @@ class Network(Module):
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
-        claims = {name: {f: item.claim for f, item in node.filters.items()} for name, node in self.nodes.items()}
+        claims = {
+            name: {f: claim_at(node, item) for f, item in node.filters.items()} for name, node in self.nodes.items()
+        }
         if self.fused:
             claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
+            if any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values()):
+                claims[FUSED] = lowered(claims)[FUSED]
         return lowered(claims) if self.single else claims
 
     def in_single_precision(self) -> "Network":
@@ -275,7 +288,7 @@ class Network(Module):
         names = self.nodes_with(item.filter)
         # A rule that needs nothing but the estimates.
         if not isinstance(item.rule, AbstractInformedFusion):
-            return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
+            return item.claim([claim_at(self.nodes[n], self.nodes[n].filters[item.filter]) for n in names])
         rule, local = type(item.rule).__name__, {n: self.nodes[n] for n in names}
         if item.quantizer is not None and not item.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
@@ -311,16 +324,18 @@ Network._repr_html_ = table_of  # type: ignore[attr-defined]
 def _world(node: Node | Listener) -> object:
     """Parts of a node that determine its measurements."""
     if isinstance(node, Node):
-        return node.sensor, anonymous(node.channel), node.informed_by
+        return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
+
+
+def claim_at(node: Node | Listener, item: AbstractFilter) -> Claim:
+    """Claim of a filter at a node."""
+    return node.claim_of(item) if isinstance(node, Node) else item.claim
 
 
 def lowered(claims: Claims) -> Claims:
     """Lower every claim to "nominal" at most."""
-    return {
-        node: {name: "none" if claim == "none" else "nominal" for name, claim in element.items()}
-        for node, element in claims.items()
-    }
+    return {node: {name: lowered_claim(claim) for name, claim in element.items()} for node, element in claims.items()}
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:

@@ -5,11 +5,15 @@ from collections.abc import Mapping
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel, check_sent
+from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of
-from heliograph.model.over_time import first
+from heliograph.model.over_time import alike, first
 from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.check import fail, shown, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
@@ -32,17 +36,20 @@ class Node(Module):
             is no limit. Recorded and live data outside count as not arrived, are counted and named. Claims stand as far
             as no honest number is among them.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
+        trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
+            `event_filter`; all others take what was not sent for missing, and then claim "nominal" at most.
 
     Raises:
         ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
             or flags of another step than those that do; another filter of the measurement next to one that is fed back;
-            limits that are none.
+            limits that are none; a trigger that does not fit, or next to feedback or a channel that is late.
     """
 
     sensor: AnySensor
     channel: Channel
     filters: dict[str, AbstractFilter]
     limits: Limits | None
+    trigger: AbstractTrigger | None
 
     def __init__(
         self,
@@ -51,12 +58,16 @@ class Node(Module):
         filters: Mapping[str, AbstractFilter],
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
+        trigger: AbstractTrigger | None = None,
     ):
+        self.trigger = trigger
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         # Sensor, channel and filters fit.
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_sent(first(sensor), first(channel))
+        if trigger is not None:
+            check_trigger(trigger, first(sensor), first(channel), self.filters)
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid)
         # Side information of the right step; feedback to one filter alone.
@@ -73,7 +84,23 @@ class Node(Module):
     @property
     def received(self) -> int:
         """Length of the measurement that reaches the filters."""
-        return int(first(self.channel).outputs)
+        known = 0 if self.trigger is None else self.trigger.side_information(len(self.outputs))
+        return int(first(self.channel).outputs) + known
+
+    @property
+    def predictor(self) -> str | None:
+        """Name of the filter whose prediction the sender compares with; None where it compares with none."""
+        if self.trigger is None or self.trigger.reference != "prediction":
+            return None
+        return next(name for name, item in self.filters.items() if _predicts(item, self.trigger))
+
+    def claim_of(self, item: AbstractFilter) -> Claim:
+        """Claim of a filter here: without the trigger it does not know why something is missing."""
+        if self.trigger is None or isinstance(self.trigger, Periodic) or not item.received:
+            return item.claim
+        rule = getattr(item, "trigger", None)
+        knows = alike(rule, self.trigger) and bool(eqx.tree_equal(rule, self.trigger))
+        return item.claim if knows else lowered_claim(item.claim)
 
     @property
     def informed_by(self) -> str | None:
@@ -93,7 +120,7 @@ class Node(Module):
     @property
     def complete(self) -> bool:
         """True if everything arrives, always."""
-        return not first(self.channel).erases
+        return not first(self.channel).erases and self.trigger is None
 
 
 @readable
@@ -124,6 +151,44 @@ class Common(Module):
 
     sensor: AnySensor
     channel: Channel
+
+
+def _predicts(item: AbstractFilter, trigger: AbstractTrigger) -> bool:
+    return isinstance(item, EventFilter | StochasticEventFilter) and item.trigger.reference == "prediction"
+
+
+def lowered_claim(claim: Claim) -> Claim:
+    """Nominal, whatever is claimed more."""
+    return "none" if claim == "none" else "nominal"
+
+
+def check_trigger(
+    trigger: AbstractTrigger, sensor: AbstractSensor, channel: AbstractRandomAffine, filters: Mapping[str, object]
+) -> None:
+    """A trigger that fits the sensor, the channel and the filters of a node.
+
+    Raises:
+        ValueError: numbers for another count of components; a channel that is late, or that does not carry each
+            component for itself where each is sent alone; no filter whose prediction the sender could know.
+    """
+    check_type("trigger", trigger, AbstractTrigger)
+    # The trigger, the sensor and the channel fit.
+    trigger.check_outputs(len(sensor.outputs))
+    if sensor.circular:
+        raise fail("trigger", "a sensor without angles", list(sensor.circular))
+    if channel.past:
+        raise fail(
+            "channel of a node with a trigger", "one that is not late", f"one late by up to {channel.past} steps"
+        )
+    if trigger.region == "each" and channel.outputs != len(sensor.outputs):
+        raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
+    # A sender that compares with a prediction knows one filter.
+    if any(isinstance(item, FedBackFilter) for item in filters.values()):
+        raise fail("trigger", "no filter that is fed back", "one")
+    if trigger.reference == "prediction" and not any(
+        isinstance(item, AbstractFilter) and _predicts(item, trigger) for item in filters.values()
+    ):
+        raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
 
 
 def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:

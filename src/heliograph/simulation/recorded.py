@@ -16,6 +16,7 @@ from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.forbidden import forbidden_rows
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
@@ -39,6 +40,7 @@ def run(
 
     Values beyond a node's limits, and those that are implausible for all filters of a node
     (`heliograph.filters.plausibility`), count as not arrived; each is warned of, with its rows from 1.
+    A value that the rule of its sender forbids is warned of and used.
 
     Args:
         network: the network.
@@ -72,6 +74,13 @@ def run(
     # Values beyond a node's limits did not arrive.
     for name in network.names:
         z[name] = _within(name, network.nodes[name], z[name])
+        # Values that the rule of a sender forbids.
+        if rows := forbidden_rows(network.nodes[name], z[name]):
+            warnings.warn(
+                f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+                "within delta of the value before, and no heartbeat due",
+                stacklevel=2,
+            )
     # Filters, and what became of the reports.
     part = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, part and part.kinds, judges=True)

@@ -37,7 +37,8 @@ class World(Module):
         drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
         states, result = self.filters.step(states, z, u, k, drawn)
         after = x, self.medium.feed_back(medium, result["estimates"]), states
-        return after, {"truth": x, "measurements": z, **_near(plant, x, result)}
+        seen = {"truth": x, "measurements": z, "transmissions": self.medium.reasons(medium), **_near(plant, x, result)}
+        return after, seen
 
 
 def _near(plant: AbstractPlant, x: jax.Array, result: dict[str, PyTree]) -> dict[str, PyTree]:

@@ -6,10 +6,8 @@ from .channels import (
 from .filters import (
     check_filter as check_filter,
 )
-from .quantizers import (
-    check_quantizer as check_quantizer,
-)
 from .fusion import (
+    check_quantizer as check_quantizer,
     check_fusion as check_fusion,
 )
 from .scaling import (

@@ -127,7 +127,9 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, item: AbstractFilte
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
     assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
-    if np.all(missing):
+    if np.all(missing) and item.silence_tells:
+        assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood of silence, got {likelihood:g}"
+    elif np.all(missing):
         assert likelihood == 0, f"step {k}: expected a log-likelihood of 0 where nothing arrived, got {likelihood:g}"
     elif item.claim != "none":
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood, got {likelihood:g}"

@@ -13,9 +13,9 @@ import numpy as np
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Link
-from heliograph.serving.storage.identity import identity
 from heliograph.serving.storage.plant_codec import plant_from
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import identity
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, Killed, killed, left_alone
 from heliograph_studies.live.mower import PLANT, Drive, network, read_drive
 from heliograph_studies.live.server import Server, find_server

@@ -10,16 +10,15 @@ import nats
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.brokers.broker import connected
+from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
-from heliograph.serving.storage.identity import identity
-from heliograph.serving.storage.in_memory_store import InMemoryStore
 from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import InMemoryStore, identity
 from heliograph_studies.live.server import Server
 
 PLANTS = 100  # mowers on the same drive, each a little after the one before

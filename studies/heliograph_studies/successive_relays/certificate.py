@@ -8,8 +8,8 @@ import numpy as np
 from heliograph.model.over_time import at
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_moments
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.relays.check import Recomputed, recompute
 from heliograph.relays.design import GainsByFilter
+from heliograph_studies.successive_relays.raw_moments import Recomputed, recompute
 
 GREEDY = 1e-8  # correlation of error and innovation below which a gain minimises its own next error
 ROUNDING = 1e-9  # relative to the trace of the larger matrix, in comparisons of covariances from raw moments

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.codegen.c.operations import literal
-from heliograph.codegen.c.source import CSource
+from heliograph.codegen.c_source import CSource, literal
 from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.program import lower, scalars

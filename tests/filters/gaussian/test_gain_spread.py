@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.gaussian.gain_spread import gain_spread
+from heliograph.filters.gaussian.factored import gain_spread
 from heliograph.model.over_time import at
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.moments.second_moments import second_order

@@ -38,13 +38,13 @@ def walk():
 def both(request):
     """A linear objective with gains that settle, the same by the plain scan, and data."""
     quick = objectives(describe(request.param))[0]
-    assert quick.settles
+    assert quick.steady
     received = quick.description.start.nodes["node"].received
     z = np.cumsum(np.random.default_rng(0).normal(size=(RECORDINGS, STEPS, received)), axis=1)
-    return quick, replace(quick, settles=False), Data(z, np.zeros((RECORDINGS, STEPS, 0)), (STEPS,) * RECORDINGS)
+    return quick, replace(quick, steady=False), Data(z, np.zeros((RECORDINGS, STEPS, 0)), (STEPS,) * RECORDINGS)
 
 
-def settles(objective, x, data):
+def becomes_steady(objective, x, data):
     with jax.enable_x64(True):
         return bool(_with_steady_gains(objective, x, data.measurements)[1])
 
@@ -56,7 +56,7 @@ def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):
     quick, plain, data = both
     x = quick.description.parameters.start
     x = x + shift[: len(x)]
-    assert settles(quick, x, data)
+    assert becomes_steady(quick, x, data)
     item, other = (at_points(item, x[None], data, LANES) for item in (quick, plain))
     for a, b in zip(item, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
@@ -69,7 +69,7 @@ def test_where_gains_do_not_settle_the_scan_is_taken(both):
     quick, plain, data = both
     x = np.stack([quick.description.parameters.start] * 3)
     x[1, 0] = -30.0
-    assert [settles(quick, item, data) for item in x] == [True, False, True]
+    assert [becomes_steady(quick, item, data) for item in x] == [True, False, True]
     item, other = (at_points(item, x, data, LANES) for item in (quick, plain))
     for a, b in zip(item, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))

@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine.base import conditional_moments
 from heliograph.random_affine.moments.interval import CORNERS, moment_interval
 from tests.as_code import printing
+from tests.random_affine.conditional import conditional_moments
 
 GAMMA = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
 XI = hg.Discrete([0.8, 0.9, 1.0], [0.2, 0.3, 0.5], 0.02)

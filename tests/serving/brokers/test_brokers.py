@@ -15,8 +15,7 @@ import nats.js.errors
 
 from heliograph.serving.brokers.mqtt import Mqtt
 from heliograph.serving.brokers.nats import Nats
-from heliograph.serving.brokers.partition import Part, part_of, word
-from heliograph.serving.brokers.transport import TakenOverError, Transport
+from heliograph.serving.brokers.transport import Part, TakenOverError, Transport, part_of, word
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.output import Output
 from heliograph_studies.live.server import Server

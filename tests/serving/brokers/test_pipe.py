@@ -15,7 +15,7 @@ from heliograph.serving.loop import keep_running
 from heliograph.serving.message import LONGEST
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
-from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store_protocol import InMemoryStore
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 

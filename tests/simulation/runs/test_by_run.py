@@ -7,8 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import read_recording
-from heliograph.relays.design import relay_schedules
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import own_error_design, relay_schedules
 from heliograph.simulation.runs.by_run import trajectories
 from tests.relays.relay_problems import example
 

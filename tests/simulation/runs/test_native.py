@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.codegen.engine import SETTING
 from heliograph.codegen.graph import Unsupported
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import own_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, Trajectories

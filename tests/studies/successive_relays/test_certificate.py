@@ -6,7 +6,7 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.law import GivenMoments
-from heliograph.relays.own_error import own_error_design
+from heliograph.relays.design import own_error_design
 from heliograph.relays.receiver_error import receiver_error_design
 from heliograph_studies.successive_relays.certificate import certify_relays
 from tests.relays.relay_problems import example, unusual

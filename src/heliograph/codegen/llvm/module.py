@@ -14,12 +14,9 @@ from heliograph.codegen.llvm.text import Writer
 from heliograph.codegen.llvm.transposed import mover
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
-from heliograph.codegen.products import products_of
-from heliograph.codegen.program import Program, needed
+from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, varying
 from heliograph.codegen.rules.loops import copied
 from heliograph.codegen.rules.random_bits import hash_function
-from heliograph.codegen.spread import varying
-from heliograph.codegen.summed import Summed, row_length
 from heliograph.codegen.vectors.elementary import functions
 
 LONGEST = 60_000  # operations: beyond, LLVM takes longer than XLA

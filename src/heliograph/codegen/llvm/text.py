@@ -6,7 +6,7 @@ from typing import Any
 from heliograph.codegen.graph import Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from heliograph.codegen.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
 from heliograph.codegen.llvm.slots import Slots
-from heliograph.codegen.products import fusable
+from heliograph.codegen.program import fusable
 
 Scope = dict[Any, str]
 

@@ -1,15 +1,20 @@
-"""Rules of inner programs: called functions, and branches by platform."""
+"""Rules of inner programs: called functions, and branches, known to be taken or selected in each run.
 
+An expensive branch is computed only if some run takes it (a guarded block).
+"""
+
+from itertools import pairwise
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Node
-from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, like
+from heliograph.codegen.graph import Block, Guard, Key, Node
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, array_of, like
 from heliograph.codegen.memory import LONG, InMemory
-from heliograph.codegen.rules.loops import in_memory, repeated
+from heliograph.codegen.rules.elementwise import select
+from heliograph.codegen.rules.loops import in_memory, repeated, size_of
 from heliograph.codegen.rules.shapes import FEW
 from heliograph.codegen.rules.views import joined
 
@@ -101,3 +106,90 @@ def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value])
 IN_MEMORY |= dict.fromkeys(CALLS, _call)
 IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "runs_last": _runs_last}
 RULES |= {"platform_index": _platform_index}
+
+
+DEAR = 100  # nodes: a branch that has fewer is computed in any case,
+SHARE = 4  # and one that is so many times smaller than the dearest, which often has its numbers within
+
+
+def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    branches = equation.params["branches"]
+    which = lowering.scalar(inputs[0])
+    if which.op == "constant":
+        taken = min(max(int(which.value), 0), len(branches) - 1)
+        return lowering.inline(branches[taken], inputs[1:])
+    if len(branches) == 1:
+        return lowering.inline(branches[0], inputs[1:])
+    # Small branches are computed in any case, large ones in guarded blocks.
+    conditions = _conditions(lowering, which, len(branches))
+    sizes = [size_of(branch.jaxpr) for branch in branches]
+    results: dict[int, list[np.ndarray]] = {}
+    for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
+        cheap = SHARE * sizes[k] <= max(sizes)
+        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:], cheap)
+    # Select the results of the branch that is taken.
+    chosen = results[len(branches) - 1]
+    for k in reversed(range(len(branches) - 1)):
+        chosen = [_where(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
+    return chosen
+
+
+def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
+    """Return for each branch whether it is taken; indices out of range select the first or last."""
+    graph = lowering.graph
+    if which.op == "convert" and which.args[0].type == "bool":
+        which = which.args[0]
+    if which.type == "bool":
+        return [graph.node("not", "bool", which), which]
+    below = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [graph.node("and", "bool", graph.node("not", "bool", a), b) for a, b in pairwise(below)]
+    return [below[0], *between, graph.node("not", "bool", below[-1])]
+
+
+def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value], cheap: bool) -> list[np.ndarray]:
+    """Compute a branch in the open block if it has few nodes, else in a guarded one."""
+    graph, outer = lowering.graph, lowering.graph.current
+    graph.current = block = Block(outer, pinned=True)
+    try:
+        results = [lowering.nodes(x) for x in lowering.inline(branch, inputs)]
+    finally:
+        graph.current = outer
+    if cheap or _size(block) <= DEAR:
+        _dissolve(block, outer)
+        return results
+    guard = Guard(block, condition)
+    outer.items.append(guard)
+    return [array_of([_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
+
+
+def _result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+    if isinstance(value, Key):
+        return Key(_result(lowering, guard, value.first), _result(lowering, guard, value.second))
+    if value.block is not guard.body:
+        return value
+    if value in guard.values:
+        return guard.results[guard.values.index(value)]
+    result = lowering.graph.fresh("guarded", value.type, (), lowering.graph.current, (guard, len(guard.values)))
+    guard.values.append(value)
+    guard.results.append(result)
+    return result
+
+
+def _size(block: Block) -> int:
+    """Count the nodes of a block; a statement in it counts as many."""
+    return sum(1 if isinstance(item, Node) else DEAR + 1 for item in block.items)
+
+
+def _dissolve(block: Block, outer: Block) -> None:
+    for item in block.items:
+        item.block = outer  # type: ignore[union-attr]
+    outer.items += block.items
+    outer.seen |= block.seen
+
+
+def _where(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
+    return array_of([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
+
+
+IN_MEMORY |= {"cond": _cond}

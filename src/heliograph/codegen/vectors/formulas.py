@@ -54,6 +54,27 @@ class Body:
         return self.add("double", f"call {double} {name}({', '.join(f'{double} {a.name}' for a in args)})")
 
 
+def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
+    """Operator of vectors: an instruction on doubles, another on integers, with its arguments turned round or not."""
+
+    def apply(self: "Vector", other: Operand) -> "Vector":
+        pair = (self, self.like(other))
+        a, b = reversed(pair) if turned else pair
+        return self.body.add(
+            self.scalar, f"{real if self.scalar == 'double' else whole} {self.type} {a.name}, {b.name}"
+        )
+
+    return apply
+
+
+def _comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
+    def compare(self: "Vector", other: Operand) -> "Vector":
+        how = f"fcmp {real}" if self.scalar == "double" else f"icmp {whole}"
+        return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
+
+    return compare
+
+
 @dataclass(frozen=True, eq=False)
 class Vector:
     """A vector in a body: doubles, 64-bit or 32-bit integers, or truths (scalars "double", "i64", "i32", "i1")."""
@@ -71,77 +92,21 @@ class Vector:
         """Convert a number to a vector of this type; vectors are returned unchanged."""
         return value if isinstance(value, Vector) else constant(self.body, self.scalar, value)
 
-    def _with(self, real: str, whole: str, other: Operand, turned: bool = False) -> "Vector":
-        pair = (self, self.like(other))
-        a, b = reversed(pair) if turned else pair
-        operation = real if self.scalar == "double" else whole
-        return self.body.add(self.scalar, f"{operation} {self.type} {a.name}, {b.name}")
-
-    def __add__(self, other: Operand) -> "Vector":
-        return self._with("fadd", "add", other)
-
-    def __radd__(self, other: Operand) -> "Vector":
-        return self._with("fadd", "add", other, turned=True)
-
-    def __sub__(self, other: Operand) -> "Vector":
-        return self._with("fsub", "sub", other)
-
-    def __rsub__(self, other: Operand) -> "Vector":
-        return self._with("fsub", "sub", other, turned=True)
-
-    def __mul__(self, other: Operand) -> "Vector":
-        return self._with("fmul", "mul", other)
-
-    def __rmul__(self, other: Operand) -> "Vector":
-        return self._with("fmul", "mul", other, turned=True)
-
-    def __truediv__(self, other: Operand) -> "Vector":
-        return self._with("fdiv", "sdiv", other)
-
-    def __rtruediv__(self, other: Operand) -> "Vector":
-        return self._with("fdiv", "sdiv", other, turned=True)
-
-    def __and__(self, other: Operand) -> "Vector":
-        return self._with("and", "and", other)
-
-    def __or__(self, other: Operand) -> "Vector":
-        return self._with("or", "or", other)
-
-    def __xor__(self, other: Operand) -> "Vector":
-        return self._with("xor", "xor", other)
-
-    def __lshift__(self, bits: Operand) -> "Vector":
-        return self._with("shl", "shl", bits)
-
-    def __rshift__(self, bits: Operand) -> "Vector":
-        """Shift arithmetically."""
-        return self._with("ashr", "ashr", bits)
+    __add__, __radd__ = _operator("fadd", "add"), _operator("fadd", "add", turned=True)
+    __sub__, __rsub__ = _operator("fsub", "sub"), _operator("fsub", "sub", turned=True)
+    __mul__, __rmul__ = _operator("fmul", "mul"), _operator("fmul", "mul", turned=True)
+    __truediv__, __rtruediv__ = _operator("fdiv", "sdiv"), _operator("fdiv", "sdiv", turned=True)
+    __and__, __or__, __xor__ = _operator("and", "and"), _operator("or", "or"), _operator("xor", "xor")
+    __lshift__, __rshift__ = _operator("shl", "shl"), _operator("ashr", "ashr")  # the second arithmetically
+    __lt__, __le__ = _comparison("olt", "slt"), _comparison("ole", "sle")
+    __gt__, __ge__ = _comparison("ogt", "sgt"), _comparison("oge", "sge")
+    equals = _comparison("oeq", "eq")  # false for NaN
 
     def __neg__(self) -> "Vector":
         return self.body.add(self.scalar, f"fneg {self.type} {self.name}")
 
     def __abs__(self) -> "Vector":
         return self.body.call("fabs", self)
-
-    def __lt__(self, other: Operand) -> "Vector":
-        return self._compared("olt", "slt", other)
-
-    def __le__(self, other: Operand) -> "Vector":
-        return self._compared("ole", "sle", other)
-
-    def __gt__(self, other: Operand) -> "Vector":
-        return self._compared("ogt", "sgt", other)
-
-    def __ge__(self, other: Operand) -> "Vector":
-        return self._compared("oge", "sge", other)
-
-    def equals(self, other: Operand) -> "Vector":
-        """Compare for equality; false for NaN."""
-        return self._compared("oeq", "eq", other)
-
-    def _compared(self, real: str, whole: str, other: Operand) -> "Vector":
-        how = f"fcmp {real}" if self.scalar == "double" else f"icmp {whole}"
-        return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
 
     def as_type(self, scalar: str) -> "Vector":
         """Reinterpret the bits as another type."""

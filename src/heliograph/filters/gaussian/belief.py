@@ -2,13 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, predicts
 from heliograph.filters.gaussian.transform import AbstractTransform, Transformed, linear_transform
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.numerics.angle import wrapped
@@ -24,7 +23,7 @@ class Belief(NamedTuple):
     covariance: Float[jax.Array, "n n"]
 
 
-class AbstractBeliefFilter(AbstractFilter):
+class AbstractBeliefFilter(AbstractSizedFilter):
     """A filter whose state is a `Belief`, predicted by a transform, or exactly where the plant is linear.
 
     Shapes: initial_mean (n,), initial_covariance (n, n).
@@ -34,10 +33,6 @@ class AbstractBeliefFilter(AbstractFilter):
     transform: AbstractTransform
     initial_mean: Array
     initial_covariance: Array
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:

@@ -1,4 +1,7 @@
-"""Linear, extended and cubature filters with a factored covariance L D L': the form for single precision."""
+"""Linear, extended and cubature filters with a factored covariance L D L': the form for single precision.
+
+The spread of a random gain enters as a sum of squares: K_r with E[(H - E H) W (H - E H)'] = sum_r K_r W K_r'.
+"""
 
 from typing import NamedTuple
 
@@ -7,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.factors import (
     Columns,
     Factors,
     columns_of,
+    columns_of_known,
     decorrelated,
     factors_of,
     gram_schmidt,
@@ -20,13 +24,12 @@ from heliograph.filters.gaussian.factors import (
     reciprocal,
     sum_of,
 )
-from heliograph.filters.gaussian.gain_spread import gain_spread
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import Cubature, Function, Linearization
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, continued, nearest, wrapped
@@ -35,6 +38,41 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise
+
+
+def gain_spread(channel: SecondOrder | OverTime) -> np.ndarray | OverTime:
+    """Operators K_r (operators, m, p + 1) of z = G y + n, H = [G, n]; one set per step where the channel varies.
+
+    A channel is described by E[(z - E z)(z - E z)' | y] alone, which leaves open how E[dH_ia dH_jb] divides between
+    (a, b) and (b, a). Where one of the two is zero because an entry never varies, the other is all; else they are taken
+    to be equal. A spread that then is no sum of squares is refused.
+
+    Raises:
+        ValueError: uncertain probabilities, a spread that is no sum of squares in this sense.
+    """
+    # One set of operators per step, padded with zeros to the same number.
+    if isinstance(channel, OverTime):
+        parts = [np.asarray(gain_spread(step)) for step in unstack(channel)]
+        most = max(len(part) for part in parts)
+        return OverTime(np.stack([np.pad(part, [(0, most - len(part)), (0, 0), (0, 0)]) for part in parts]))
+    if channel.uncertain:
+        raise fail("single precision", "a channel whose probabilities are known", "uncertain ones")
+    # Entries of H that vary, and how a pair's moment divides between (a, b) and (b, a).
+    tensor = np.asarray(channel.spread.center)
+    m, p = tensor.shape[0], tensor.shape[2]
+    varies = np.einsum("iiaa->ia", tensor) > 0
+    straight = varies[:, None, :, None] & varies[None, :, None, :]  # (i, a) with (j, b)
+    crossed = straight.swapaxes(2, 3)
+    share = np.where(straight & crossed, 1.0, np.where(straight, 2.0, 0.0))
+    same = np.eye(m, dtype=bool)[:, :, None, None] | np.eye(p, dtype=bool)
+    # E[vec dH vec dH'] = sum_r vec K_r vec K_r'.
+    whole = np.where(same, tensor, share * tensor).transpose(0, 2, 1, 3).reshape(m * p, m * p)
+    try:
+        root = columns_of_known(whole)
+    except ValueError:
+        expected = "a channel whose gain varies by a sum of squares (one gain for each output, or for all)"
+        raise fail("single precision", expected, "outputs whose gains mix several inputs") from None
+    return root.T.reshape(-1, m, p)
 
 
 class Moments(NamedTuple):
@@ -59,7 +97,7 @@ class Image(NamedTuple):
     curvature: list[Columns]
 
 
-class FactoredFilter(AbstractFilter):
+class FactoredFilter(AbstractSizedFilter):
     """A `GaussianFilter` or `LinearFilter` whose covariance is carried as L D L'.
 
     With y = H x + e and z = G y + n, M = E[G], K_r the operators of the gain's spread, the noise of z given x is the
@@ -80,10 +118,6 @@ class FactoredFilter(AbstractFilter):
     from_prior: bool = eqx.field(static=True)  # the spread acts on the state's moments before data
     random_gain: bool = eqx.field(static=True)
     angles: Angles = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> FactoredBelief:

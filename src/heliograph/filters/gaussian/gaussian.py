@@ -31,6 +31,7 @@ from heliograph.numerics.small_matrix import times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
+from heliograph.random_affine.outliers import is_bounded
 
 Element = TypeVar("Element", AbstractRandomAffine, SecondOrder)
 
@@ -159,7 +160,8 @@ def _build(
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
-    claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
+    proved: Claim = "upper" if is_bounded(plant, sensor, channel) else "exact"
+    claim = proved if linear and trusted and not own_prior else "nominal"
     return GaussianFilter(
         plant=plant,
         sensor=sensor,

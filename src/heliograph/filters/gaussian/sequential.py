@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, at, first, stack
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
 
-class SequentialFilter(AbstractFilter):
+class SequentialFilter(AbstractSizedFilter):
     """Predict with the first node's filter, then correct with each node's in turn; z is the nodes' measurements joined.
 
     The posterior of one node is the prior of the next. Behind uncertain gains the first correction is not a conditional
@@ -29,10 +29,6 @@ class SequentialFilter(AbstractFilter):
     """
 
     filters: tuple[GaussianFilter, ...]
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:

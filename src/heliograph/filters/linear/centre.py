@@ -16,7 +16,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.about_mean import about_mean
+from heliograph.random_affine.moments.moment_noise import about_mean
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 

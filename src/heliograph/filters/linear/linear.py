@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import describe
 from heliograph.filters.gaussian.rounding import above_rounding, initial_size
@@ -23,7 +23,7 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -35,6 +35,7 @@ from heliograph.numerics.small_matrix import congruence, times, times_vector, tr
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
+from heliograph.random_affine.outliers import is_bounded
 
 
 class LinearBelief(NamedTuple):
@@ -49,7 +50,7 @@ class LinearBelief(NamedTuple):
     state_covariance: Float[jax.Array, "n n"]
 
 
-class LinearFilter(AbstractFilter):
+class LinearFilter(AbstractSizedFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind a random affine channel z = G y + n.
 
     With y = C x + v, M = E[G] and Y = E[y y'] = C E[x x'] C' + R:
@@ -74,10 +75,6 @@ class LinearFilter(AbstractFilter):
     channel: SecondOrder | OverTime
     rule: Polytope
     mean_known: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> LinearBelief:
@@ -247,6 +244,8 @@ def linear_filter(
     if first(channel).remembers:
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
+        if is_bounded(plant, sensor, channel):
+            raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         if first(channel).erases:
             return side_information_filter(plant, sensor, channel)
         if uncertain_chain(channel):
@@ -263,7 +262,7 @@ def linear_filter(
         channel=described,
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
-        claim="upper" if whole.uncertain else "exact",
+        claim="upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact",
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled, in_float64
@@ -41,7 +41,7 @@ class PlannedMean(NamedTuple):
     stage: Int[jax.Array, ""]
 
 
-class PlannedFilter(AbstractFilter):
+class PlannedFilter(AbstractSizedFilter):
     """A filter whose gains and covariances are known for each step; only the mean is left to compute.
 
     Valid for the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built
@@ -57,10 +57,6 @@ class PlannedFilter(AbstractFilter):
     covariances: Array
     start: Array
     projection: Array | None
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
     past: OverTime | None = None
 
     @in_float64

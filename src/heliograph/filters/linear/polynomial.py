@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.centre import Centre, centre_of, without_mean
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
@@ -37,7 +37,7 @@ class Centred(NamedTuple):
     mean: Float[Array, " n"]
 
 
-class PolynomialFilter(AbstractFilter):
+class PolynomialFilter(AbstractSizedFilter):
     """Filter of all monomials of z up to `degree`; a missing component makes each of its monomials missing.
 
     The innovation is that of z itself, among its monomials, with its exact covariance; the log-likelihood is Gaussian
@@ -57,10 +57,6 @@ class PolynomialFilter(AbstractFilter):
     centre: Centre | None
     degree: int = eqx.field(static=True)
     endless: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
         instance("inner filter", inner, AbstractFilter, "a filter")
@@ -229,7 +225,7 @@ class MemoryState(NamedTuple):
     products: ScheduleState
 
 
-class MemoryFilter(AbstractFilter):
+class MemoryFilter(AbstractSizedFilter):
     """Quadratic filter with memory: its measurement is z, its squares, and the products of z and the linear estimate.
 
     With saved gains, for complete data; see `ScheduledFilter` for the effect of gaps, `PolynomialFilter` for the
@@ -238,10 +234,6 @@ class MemoryFilter(AbstractFilter):
 
     linear: ScheduledFilter
     products: ScheduledFilter
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim):
         self.linear, self.products, self.claim = linear, products, claim

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
 from heliograph.filters.innovation import gaussian_innovation
@@ -39,7 +38,7 @@ class ScheduleState(NamedTuple):
     stage: Int[jax.Array, ""]
 
 
-class ScheduledFilter(AbstractFilter):
+class ScheduledFilter(AbstractSizedFilter):
     """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d, a few products of a matrix and a vector per step.
 
     The prediction assumes that the expected measurement arrives, e = G s + g; a correction adds K (z - e) and J (z -
@@ -58,10 +57,6 @@ class ScheduledFilter(AbstractFilter):
     gains: OverTime
     covariances: np.ndarray
     start: np.ndarray
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
         instance("schedule", schedule, Schedule, "a Schedule")
@@ -133,7 +128,7 @@ def _if_expected(g: Gains) -> Gains:
     )
 
 
-class LinearSystemFilter(AbstractFilter):
+class LinearSystemFilter(AbstractSizedFilter):
     """The best linear filter of a linear system, with its covariance propagated: exact also for data with gaps.
 
     A component of z that did not arrive is left out of the step, as if that channel were off. Which components arrive
@@ -149,10 +144,6 @@ class LinearSystemFilter(AbstractFilter):
     mean: np.ndarray
     covariance: np.ndarray
     projection: np.ndarray
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
         instance("system", system, LinearSystem, "a LinearSystem")

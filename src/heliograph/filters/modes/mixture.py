@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import log_density, mixed_innovation
 from heliograph.filters.modes.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -62,7 +62,7 @@ class MixtureBelief(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
-class MixtureFilter(AbstractFilter):
+class MixtureFilter(AbstractSizedFilter):
     """One Gaussian for the state; at each step every combination of the measurement's atoms, then moment matching.
 
     With z = G_a x + c_a + N(0, R_a) and probability p_a, the posterior is a mixture of as many Gaussians with weights
@@ -79,10 +79,6 @@ class MixtureFilter(AbstractFilter):
     components: Components | OverTime
     initial: Float[Array, " M"]
     observed_angles: Angles = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @property
     def of_atoms(self) -> bool:

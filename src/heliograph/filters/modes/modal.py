@@ -6,14 +6,13 @@ that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All 
 c = E[x] before data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
@@ -28,7 +27,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stacked
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import nominal_spread
 
@@ -63,7 +62,29 @@ class ModalBelief(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
-class ModalFilter(AbstractFilter):
+class AbstractModalFilter(AbstractSizedFilter):
+    """Linear filter of the state jointly with the modes of links with memory: its state estimates zeta."""
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: ObservationModel | OverTime
+    initial: Float[Array, " M"]
+
+    @in_float64
+    def estimate(self, state: PyTree) -> Estimate:
+        """x = sum_j zeta^j."""
+        projection = self._projection()
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """Precompute all covariances and gains."""
+        return plan(self, inputs, self._projection())
+
+    def _projection(self) -> Float[np.ndarray, "n N"]:
+        return sum_of_modes(len(self.states), len(self.initial))
+
+
+class ModalFilter(AbstractModalFilter):
     """The linear minimum-mean-square-error filter of a linear plant behind links with memory.
 
     The estimate of zeta includes the modes' probabilities; its covariance is singular, since the modes' indicators
@@ -72,15 +93,6 @@ class ModalFilter(AbstractFilter):
 
     Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
     """
-
-    plant: AnyPlant
-    sensor: AnySensor
-    channel: ObservationModel | OverTime
-    initial: Float[Array, " M"]
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> ModalBelief:
@@ -138,12 +150,6 @@ class ModalFilter(AbstractFilter):
         observed, common = without_common(gains @ measure, law)
         return joined(observed), added, common
 
-    @in_float64
-    def estimate(self, state: ModalBelief) -> Estimate:
-        """x = sum_j zeta^j."""
-        projection = sum_of_modes(len(self.states), len(self.initial))
-        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
-
     def smoother_step(
         self,
         before: ModalBelief,
@@ -165,12 +171,8 @@ class ModalFilter(AbstractFilter):
             innovation.value,
             innovation.covariance,
             self.claim,
-            sum_of_modes(len(self.states), len(self.initial)),
+            self._projection(),
         )
-
-    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
-        return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
 
 
 def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
@@ -267,15 +269,23 @@ def blocks(parts: jax.Array) -> jax.Array:
     return placed.reshape(modes * size, modes * size)
 
 
+M = TypeVar("M", bound=AbstractModalFilter)
+
+
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """Best linear filter behind links with memory; `linear_filter` has checked that the parts fit."""
+    return built_of_modes(ModalFilter, plant, sensor, channel, claim_of_modes(channel))
+
+
+def built_of_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> M:
+    """Build a filter of this kind with the channel's observation models."""
     start, (initial, described) = first(plant), observation_models(channel)
-    return ModalFilter(
+    return kind(
         plant=plant,
         sensor=sensor,
         channel=described,
         initial=initial,
-        claim=claim_of_modes(channel),
+        claim=claim,
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -16,7 +16,7 @@ from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, 
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AnyPlant
@@ -50,7 +50,7 @@ class ModeObservedBelief(NamedTuple):
         return self.belief.mean
 
 
-class ModeObservedFilter(AbstractFilter):
+class ModeObservedFilter(AbstractSizedFilter):
     """Best linear filter given the states of the links' memories, at each step with z, or of the step before (`late`).
 
     The received vector is z followed by the states of the memories, as `with_flag` delivers them. If they are late, the
@@ -64,10 +64,6 @@ class ModeObservedFilter(AbstractFilter):
     sensor: AnySensor
     channel: Channel
     late: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> ModeObservedBelief:

@@ -4,43 +4,111 @@ Each uses the Markov chain, updates through each mode's map with a Gaussian upda
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.merging import (
-    AbstractMerging,
-    MergeAll,
-    MergeByMode,
-    MergeByNextMode,
-    ModalBeliefs,
-    merged,
-)
 from heliograph.filters.modes.mode_observations import describe_modes, receive
 from heliograph.filters.modes.side_information import SideInformation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.module import Module
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import symmetric
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+
+
+class ModalBeliefs(NamedTuple):
+    """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
+
+    Shapes: mean (M, n), covariance (M, n, n), weight (M, M). `moved` is true from the first prediction on.
+    """
+
+    mean: Float[jax.Array, "M n"]
+    covariance: Float[jax.Array, "M n n"]
+    weight: Float[jax.Array, "M M"]
+    moved: Bool[jax.Array, ""]
+
+
+class AbstractMerging(Module):
+    """Rule that decides when the Gaussians of modes are merged."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Components and weights after a transition of the chain, before that of the plant."""
+        raise NotImplementedError
+
+    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (component, mode) of the measurement update: all that can have a weight."""
+        items = np.arange(modes)
+        return items, items
+
+
+class MergeAll(AbstractMerging):
+    """One Gaussian for all modes (GPB1)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Replace every component by the whole mixture."""
+        law = jnp.sum(state.weight @ rows, axis=0)
+        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+        every = [jnp.repeat(part, len(rows), axis=0) for part in whole]
+        return state._replace(mean=every[0], covariance=every[1], weight=jnp.diag(law))
+
+
+class MergeByNextMode(AbstractMerging):
+    """One Gaussian per mode, mixed by the mode that the chain comes from (IMM)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Component j becomes the mixture of all components that lead to mode j."""
+        (mean, covariance), law = merged(state.mean, state.covariance, state.weight @ rows)
+        return state._replace(mean=mean, covariance=covariance, weight=jnp.diag(law))
+
+
+class MergeByMode(AbstractMerging):
+    """One Gaussian per mode, each updated in every next mode (GPB2)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Components keep the mode of their last update."""
+        (mean, covariance), law = merged(state.mean, state.covariance, state.weight)
+        return state._replace(mean=mean, covariance=covariance, weight=law[:, None] * rows)
+
+    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pair every component with every mode."""
+        return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
+
+
+@runs_last
+def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
+    """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
+    law = jnp.sum(weight, axis=0)
+    share = jnp.where(law > 0, weight * (1 / jnp.where(law > 0, law, 1.0)), 1 / len(weight))
+    center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
+    apart = mean[:, None] - center
+    inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
+    spread = jnp.sum(share[:, :, None, None] * inside, axis=0)
+    return Belief(center, jnp.moveaxis(symmetric(jnp.moveaxis(spread, 0, 2)), 2, 0)), law
+
 
 NODES = 3  # modes that stand for a gain that drifts
 
 
-class MultipleModelFilter(AbstractFilter):
+class MultipleModelFilter(AbstractSizedFilter):
     """Filter of the state and of the mode of links with memory; built by `imm_filter`, `gpb1_filter` and `gpb2_filter`.
 
     Nominal: mixtures are reduced to two moments. The innovation is that of the mixture, as is its log-likelihood.
@@ -53,10 +121,6 @@ class MultipleModelFilter(AbstractFilter):
     merging: AbstractMerging
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> ModalBeliefs:
@@ -124,6 +188,21 @@ def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Ar
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
+def link_by_mode(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, nodes: int
+) -> tuple[AbstractPlant, Angles, Array, SideInformation | OverTime]:
+    """Return the plant at the start, received angles, the modes' initial law, and the channel by mode.
+
+    A gain that drifts has `nodes` modes.
+
+    Raises:
+        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
+    """
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    check_link(first(sensor), first(channel), len(start.states))
+    return start, received_angles(plant, sensor, channel), *describe_modes(channel, nodes)
+
+
 def _build(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -132,11 +211,7 @@ def _build(
     transform: AbstractTransform | None,
     nodes: int,
 ) -> MultipleModelFilter:
-    start = instance("plant", first(plant), AbstractPlant, "a plant")
-    check_link(first(sensor), first(channel), len(start.states))
-    # Channel by mode, with `nodes` modes for a gain that drifts.
-    angles = received_angles(plant, sensor, channel)
-    initial, described = describe_modes(channel, nodes)
+    start, angles, initial, described = link_by_mode(plant, sensor, channel, nodes)
     return MultipleModelFilter(
         plant=plant,
         sensor=sensor,
@@ -153,11 +228,7 @@ def _build(
 
 
 def imm_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """Interacting multiple model filter of a plant behind links with memory: one Gaussian per mode.
 
@@ -183,11 +254,7 @@ def imm_filter(
 
 
 def gpb1_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """First-order generalised pseudo-Bayes filter behind links with memory: one Gaussian and the modes' probabilities.
 
@@ -211,11 +278,7 @@ def gpb1_filter(
 
 
 def gpb2_filter(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    transform: AbstractTransform | None = None,
-    nodes: int = NODES,
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
     """Second-order generalised pseudo-Bayes filter: a Gaussian per mode, each updated in every next mode, M^2 updates.
 

@@ -6,23 +6,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.merging import merged
-from heliograph.filters.modes.mode_observations import describe_modes, receive
-from heliograph.filters.modes.multiple_model import together
+from heliograph.filters.modes.mode_observations import receive
+from heliograph.filters.modes.multiple_model import link_by_mode, merged, together
 from heliograph.filters.modes.side_information import SideInformation
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrapped
-from heliograph.numerics.check import check_count, instance
+from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
@@ -44,7 +42,7 @@ class Particles(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
-class ParticleFilter(AbstractFilter):
+class ParticleFilter(AbstractSizedFilter):
     """Particles draw the modes; given their path the state is Gaussian (Rao-Blackwell). Built by `particle_filter`.
 
     Its random numbers come from the seed and from the data, so that runs draw independently and the same data give the
@@ -59,10 +57,6 @@ class ParticleFilter(AbstractFilter):
     observed_angles: Angles = eqx.field(static=True)
     particles: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Particles:
@@ -163,11 +157,7 @@ def particle_filter(
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
         2001.
     """
-    start = instance("plant", first(plant), AbstractPlant, "a plant")
-    check_link(first(sensor), first(channel), len(start.states))
-    # Channel by mode, with `nodes` modes for a gain that drifts.
-    angles = received_angles(plant, sensor, channel)
-    initial, described = describe_modes(channel, nodes)
+    start, angles, initial, described = link_by_mode(plant, sensor, channel, nodes)
     return ParticleFilter(
         plant=plant,
         sensor=sensor,

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import pseudo_solve
 from heliograph.filters.modes.modal import joined, measured_about, moved_about, padded, sum_of_modes, without_common
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
@@ -68,7 +68,7 @@ class SideInformationBelief(NamedTuple):
         return jnp.sum(self.moments, axis=0)[-count:, -count:]
 
 
-class SideInformationFilter(AbstractFilter):
+class SideInformationFilter(AbstractSizedFilter):
     """A linear filter that weights the modes by side information with each packet, and conditions its covariance on it.
 
     A flag (and whether a packet arrived) changes the law of the modes, and with it the accuracy of the estimate so far:
@@ -90,10 +90,6 @@ class SideInformationFilter(AbstractFilter):
     channel: SideInformation | OverTime
     initial: Float[Array, " M"]
     flagged: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> SideInformationBelief:

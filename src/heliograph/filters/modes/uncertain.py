@@ -8,35 +8,32 @@ Terms that depend on the law p of the modes are bounded over the interval of pos
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.linear.plan import plan
+from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.modes.modal import (
-    ObservationModel,
+    AbstractModalFilter,
+    built_of_modes,
     claim_of_modes,
     joined,
     known_part,
     linear_observation,
     measured_about,
     moved_about,
-    observation_models,
     prior_of_modes,
-    sum_of_modes,
     without_common,
 )
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import eigh, symmetrize
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.numerics.types import ArrayLike, Bool, Float
 
 
 class UncertainBelief(NamedTuple):
@@ -58,20 +55,11 @@ class UncertainBelief(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
-class UncertainModalFilter(AbstractFilter):
+class UncertainModalFilter(AbstractModalFilter):
     """A linear filter whose covariance bounds its error's for every chain within the radius of the nominal one.
 
     Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.
     """
-
-    plant: AnyPlant
-    sensor: AnySensor
-    channel: ObservationModel | OverTime
-    initial: Float[Array, " M"]
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> UncertainBelief:
@@ -121,12 +109,6 @@ class UncertainModalFilter(AbstractFilter):
         mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
-    @in_float64
-    def estimate(self, state: UncertainBelief) -> Estimate:
-        """x = sum_j zeta^j."""
-        projection = sum_of_modes(len(self.states), len(self.initial))
-        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
-
     def smoother_step(
         self,
         before: UncertainBelief,
@@ -141,12 +123,8 @@ class UncertainModalFilter(AbstractFilter):
         move, _, _ = moved_about(at(self.plant, k), u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
-        projection = sum_of_modes(len(self.states), len(self.initial))
-        return replace(moments_smoother_step(after, prior, cross, "nominal"), projection=jnp.asarray(projection))
-
-    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
-        return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
+        moments = moments_smoother_step(after, prior, cross, "nominal")
+        return replace(moments, projection=jnp.asarray(self._projection()))
 
 
 def _ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
@@ -214,14 +192,5 @@ def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
     """Build the filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
-    start, (initial, described) = first(plant), observation_models(channel)
-    return UncertainModalFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
-        initial=initial,
-        claim="upper" if claim_of_modes(channel) == "exact" else "nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
-    )
+    claim: Claim = "upper" if claim_of_modes(channel) == "exact" else "nominal"
+    return built_of_modes(UncertainModalFilter, plant, sensor, channel, claim)

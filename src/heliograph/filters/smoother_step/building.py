@@ -1,4 +1,4 @@
-"""Construction of smoother steps from the states around a correction and its innovation."""
+"""Construction of smoother steps around a correction: linear ones by its innovation, others by moments."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,15 +8,73 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.plausibility import innovation_distance
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point, applied, less
 from heliograph.filters.smoother_step.linear import LinearSmootherStep
-from heliograph.filters.smoother_step.moments import MomentsSmootherStep
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, times, transpose
+from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
 from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Array, Float
+
+
+class MomentsSmootherStep(AbstractSmootherStep):
+    """Any update: prior mean and covariance too, and cross = Cov(y before the step, y after its prediction).
+
+    J = cross (P-)^+: y_s = y + J (y_s+ - y-), P_s = P + J (P_s+ - P-) J'. Exact where the covariances are.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+
+    prior_mean: Float[jax.Array, "*time N"]
+    prior_covariance: Float[jax.Array, "*time N N"]
+    cross: Float[jax.Array, "*time N N"]
+
+    def end(self) -> Moments:
+        """Moments of the filter at the last step."""
+        return Moments(self.mean, self.covariance)
+
+    def back(self, later: Moments, mean: jax.Array, covariance: jax.Array) -> Moments:
+        """Pass back through J: y + J (y_s+ - y-), P + J (P_s+ - P-) J'."""
+        gain = self._gain()
+        news = applied(gain, later.mean - self.prior_mean)
+        return Moments(mean + news, less(covariance, gain, self.prior_covariance - later.covariance))
+
+    def smoothed(self, later: Moments) -> Moments:
+        """Return the moments as they are."""
+        return later
+
+    def ahead(self, point: Point) -> Point:
+        """x_j + M (y - y-) and P_j - M (P- - P) M', M the product of all J since j."""
+        gain = _product_of(point.link, self._gain())
+        news = applied(gain, self.mean - self.prior_mean)
+        return Point(point.mean + news, less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+
+    def without_data(self) -> AbstractSmootherStep:
+        """Return the step without both means."""
+        none = jnp.zeros_like(self.mean)
+        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
+        """Return the step with these means."""
+        return replace(self, mean=mean, prior_mean=prior_mean)
+
+    def _link(self, n: int) -> jax.Array:
+        return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
+
+    def _gain(self) -> jax.Array:
+        return _solved(self.prior_covariance, self.cross)
+
+
+@runs_last
+def _solved(a: jax.Array, b: jax.Array) -> jax.Array:
+    """B A^+."""
+    return transpose(solve(a, transpose(b)))
+
+
+@runs_last
+def _product_of(a: jax.Array, b: jax.Array) -> jax.Array:
+    return times(a, b)
 
 
 def with_nis(step: AbstractSmootherStep, innovation: Innovation) -> AbstractSmootherStep:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
@@ -15,7 +15,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialM
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
@@ -46,7 +46,7 @@ class ClockBelief(NamedTuple):
     observed: Bool[jax.Array, " clocks"]
 
 
-class ClockFilter(AbstractFilter):
+class ClockFilter(AbstractSizedFilter):
     """A Gaussian filter of a plant with clocks, in which a clock that cannot be observed is considered, not estimated.
 
     An offset o enters as y - o dy/dt. It is observable against another clock on the same plant, and while the plant
@@ -67,10 +67,6 @@ class ClockFilter(AbstractFilter):
 
     base: GaussianFilter
     offsets: tuple[int, ...] = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> ClockBelief:

@@ -1,7 +1,6 @@
 """Filters behind delayed links: constant delays, delays known at the receiver, and lines of past signals."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,95 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.linear.plan import PlannedFilter
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.filters.wrappers.held import HeldFilter, relayed_filter, with_relays
+from heliograph.filters.wrappers.part import AbstractPartFilter, PartFilter
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
 from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+from heliograph.numerics.types import ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.delay import Delayed, of_line, sent
 from heliograph.random_affine.in_line import Relayed
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-
-
-class PartFilter(AbstractFilter):
-    """A filter of a larger system that estimates its first states alone. Built by `part_filter`."""
-
-    base: AbstractFilter
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    def __init__(self, base: AbstractFilter, states: int):
-        self.base, self.claim, self.states = base, base.claim, base.states[:states]
-        self.inputs, self.received = base.inputs, base.received
-
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the larger filter's initial state."""
-        return self.base.init()
-
-    @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict with the larger filter."""
-        return self.base.predict(state, u, k)
-
-    @corrects
-    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the larger filter."""
-        return self.base.correct(state, z, k)
-
-    @in_float64
-    def estimate(self, state: PyTree) -> Estimate:
-        """Mean and covariance of the first states."""
-        return self._part(self.base.estimate(state))
-
-    def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """Mean and covariance of the first states after step k."""
-        return self._part(self.base.after_step(state, k))
-
-    def _part(self, estimate_: Estimate) -> Estimate:
-        n = len(self.states)
-        return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
-
-    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all that does not depend on data."""
-        plan, n = self.base.planned(inputs), len(self.states)
-        if not isinstance(plan, PlannedFilter):
-            return PartFilter(plan, n)
-        projection = jnp.eye(len(self.base.states)) if plan.projection is None else jnp.asarray(plan.projection)
-        return replace(plan, covariances=plan.covariances[:, :n, :n], projection=projection[:n], states=self.states)
-
-
-def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
-    """Restrict a filter to its first states, as those of the plant in a system enlarged by `with_past`.
-
-    Args:
-        filter: the filter of the larger system.
-        states: how many of its states are estimated, counted from the first.
-
-    Claim: that of `filter`.
-
-    Raises:
-        ValueError: no filter, more states than it has.
-
-    Source: a part of a linear estimate is the estimate of that part.
-    """
-    instance("filter", filter, AbstractFilter, "a filter")
-    if check_count("states", states) > len(filter.states):
-        raise fail("states", f"at most the filter's {len(filter.states)}", states)
-    return PartFilter(filter, states)
 
 
 class LateState(NamedTuple):
@@ -108,7 +37,7 @@ class LateState(NamedTuple):
     step: Int[jax.Array, ""]
 
 
-class LateFilter(AbstractFilter):
+class LateFilter(AbstractSizedFilter):
     """A filter behind a link with constant delay d: it filters at time k - d and predicts d steps ahead.
 
     This is the best linear filter with the past as states, without its cost. Built by `late_filter`.
@@ -116,10 +45,6 @@ class LateFilter(AbstractFilter):
 
     base: AbstractFilter
     delay: int = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractFilter, delay: int):
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
@@ -182,7 +107,7 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     return LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
 
 
-class KnownDelayFilter(AbstractFilter):
+class KnownDelayFilter(AbstractPartFilter):
     """The best linear filter behind a link with time stamps: the delay of each value is its last received component.
 
     It estimates the past signals as well, so that a signal received twice counts once, with two channel noises: joint
@@ -193,20 +118,6 @@ class KnownDelayFilter(AbstractFilter):
 
     base: AbstractFilter
     channels: SecondOrder
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the state before any data."""
-        return self.base.init()
-
-    @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict over step k, and shift the line of past signals."""
-        return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
@@ -221,12 +132,6 @@ class KnownDelayFilter(AbstractFilter):
         flag_innovation, covariance = with_flag(innovation.covariance, delay)
         likelihood = jnp.where(known, innovation.log_likelihood, 0.0)
         return used, Innovation(jnp.append(innovation.value, flag_innovation), covariance, likelihood)
-
-    @in_float64
-    def estimate(self, state: PyTree) -> Estimate:
-        """Mean and covariance of the plant's states."""
-        n, published = len(self.states), self.base.estimate(state)
-        return Estimate(published.mean[:n], published.covariance[:n, :n], self.claim)
 
 
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]

@@ -2,11 +2,10 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
 from heliograph.filters.gaussian.rounding import initial_size
@@ -30,7 +29,7 @@ class FedBackBelief(NamedTuple):
     reference: Float[jax.Array, " m"]
 
 
-class FedBackFilter(AbstractFilter):
+class FedBackFilter(AbstractSizedFilter):
     """Filter whose estimate is fed back to the sensor: z = G (y - r) + n with r = h(f(xhat, u)), which both compute.
 
     y - r has the mean E[y] - r, zero for a linear model, and the covariance of the innovation: that alone costs power,
@@ -45,10 +44,6 @@ class FedBackFilter(AbstractFilter):
     """
 
     base: GaussianFilter
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
         """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""

@@ -4,17 +4,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, Step, predicts
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import plan
+from heliograph.filters.wrappers.part import AbstractPartFilter
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -25,7 +24,7 @@ from heliograph.random_affine.moments.second_moments import SecondOrder, second_
 from heliograph.random_affine.noise import Gaussian, Independent
 
 
-class HeldFilter(AbstractFilter):
+class HeldFilter(AbstractPartFilter):
     """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
     Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
@@ -40,15 +39,6 @@ class HeldFilter(AbstractFilter):
     base: AbstractFilter
     links: tuple[SecondOrder, ...]
     lines: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    @in_float64
-    def init(self) -> PyTree:
-        """Return the prior, with empty lines."""
-        return self.base.init()
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
@@ -57,17 +47,6 @@ class HeldFilter(AbstractFilter):
         for link, line in zip(self.links, self.lines, strict=True):
             state = _received_by(state, link, *line)
         return state
-
-    @corrects
-    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the components of z that arrived."""
-        return self.base.correct(state, z, k)
-
-    @in_float64
-    def estimate(self, state: PyTree) -> Estimate:
-        """Mean and covariance of the plant's states."""
-        n, known = len(self.states), self.base.estimate(state)
-        return Estimate(known.mean[:n], known.covariance[:n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

@@ -2,12 +2,10 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
-
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike
@@ -20,17 +18,13 @@ class Ahead(NamedTuple):
     prior: Belief
 
 
-class PredictionFilter(AbstractFilter):
+class PredictionFilter(AbstractSizedFilter):
     """A Gaussian filter whose estimate at step k is made before z_k is used: from z_0 ... z_k-1.
 
     Mean and covariance are those of f(x, u) + w; z_k is used for the next step. Built by `prediction_of`.
     """
 
     base: GaussianFilter
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     def __init__(self, base: GaussianFilter):
         self.base, self.claim = base, base.claim

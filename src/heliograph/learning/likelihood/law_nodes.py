@@ -19,11 +19,11 @@ Map = TypeVar("Map", bound=AbstractRandomAffine)
 
 
 def law_nodes(law: AbstractLaw, count: int) -> Discrete:
-    """The law as `count` gains with probabilities, far into its tails.
+    """Approximate a law by `count` gains with probabilities, far into its tails.
 
     int f(g) dF(g) = int f(F^-1(Phi(t))) phi(t) dt by the trapezoidal rule on |t| <= REACH, Phi the normal distribution
     function: its error falls as exp(-2 pi^2 / h^2) with the distance h of the nodes. A law of finitely many values is
-    itself. Of a law of your own, which knows no F^-1, the nodes are quantiles of DRAWS samples.
+    itself. Of a user's law, which has no F^-1, the nodes are quantiles of DRAWS samples.
 
     Raises:
         ValueError: fewer than 2 nodes, a law that cannot be sampled.
@@ -33,6 +33,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
         return Discrete(law.values, law.probabilities)
     if isinstance(law, Constant):
         return Discrete([float(law.value)], [1.0])
+    # F^-1(Phi(t)) at the nodes
     points, weights = _normal(count)
     match law:
         case Rayleigh():
@@ -49,7 +50,7 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def with_nodes(channel: Map, count: int) -> Map:
-    """The channel with each gain's law as finitely many values."""
+    """Channel with each gain's law as finitely many values."""
 
     def is_law(item: object) -> bool:
         return isinstance(item, AbstractLaw)
@@ -63,7 +64,7 @@ def with_nodes(channel: Map, count: int) -> Map:
 
 @cache
 def _normal(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Phi(t) at the nodes, and their weights."""
+    """Values of Phi(t) at the nodes, and their weights."""
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
     return np.asarray(ndtr(t)), weights / weights.sum()

@@ -20,7 +20,7 @@ Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
 
 
 class Maximum(NamedTuple):
-    """Where each lane came to: the point, its likelihood, whether it converged, and the steps taken.
+    """Ends of the climbs: the point of each lane, its likelihood, whether it converged, and the steps taken.
 
     Shapes: x (lanes, p), total (lanes,), converged (lanes,).
     """
@@ -74,7 +74,7 @@ def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray) -> _State:
 
 
 def _judged(state: _State, moving: np.ndarray) -> _State:
-    """Which lanes have arrived: the gain that an undamped step promises is nothing."""
+    """Mark the lanes that have arrived: the gain that an undamped step promises is nothing."""
     whole = steps_of(state.gradient, state.information, np.zeros(len(state.x)), moving)
     promised = np.sum(np.clip(whole, -LONGEST, LONGEST) * np.nan_to_num(state.gradient), axis=1)
     stuck = state.damping > HARDEST
@@ -86,10 +86,12 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
     step = np.clip(steps_of(state.gradient, state.information, state.damping, moving), -LONGEST, LONGEST)
     going = ~state.done
     tried = np.where(going[:, None] & (step != 0), state.x + step, state.x)
+    # a damped step, accepted where the likelihood does not fall
     total, gradient, information = evaluate(tried)
     sound = np.isfinite(total) & np.isfinite(gradient).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
     gain = total - state.total
     better = going & sound & (gain >= -NOISE * np.abs(state.total))
+    # damping by the ratio of gain and promise
     promised = np.sum(step * (state.gradient - np.einsum("lij,lj->li", state.information, step) / 2), axis=1)
     softer = np.clip(1 - (2 * gain / np.maximum(promised, 1e-300) - 1) ** 3, 1 / 5, 4.0)  # Nielsen's rule
     harder = np.where(going, np.maximum(state.damping, 1e-3) * state.growth, state.damping)
@@ -111,7 +113,7 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
 def steps_of(
     gradient: np.ndarray, information: np.ndarray, damping: np.ndarray, moving: np.ndarray
 ) -> Float[np.ndarray, "lanes p"]:
-    """(I + damping diag I)^-1 s among the coordinates that move; none in directions that are flat."""
+    """Steps (I + damping diag I)^-1 s of the coordinates that move; none in directions that are flat."""
     there = moving & (np.diagonal(information, axis1=1, axis2=2) > 0)
     unit = np.where(there, 1 / np.sqrt(np.where(there, np.diagonal(information, axis1=1, axis2=2), 1.0)), 0.0)
     scaled = np.nan_to_num(information * unit[:, :, None] * unit[:, None, :])

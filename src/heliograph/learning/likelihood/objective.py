@@ -1,4 +1,4 @@
-"""What a fit maximises: a filter's likelihood as a function of the free numbers, with scores and information."""
+"""Objective of a fit: the likelihood of all nodes together as a function of the free numbers, scores, information."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -15,18 +15,62 @@ from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.linear import LinearFilter, linear_filter
 from heliograph.learning.description import Description
 from heliograph.learning.likelihood import steady_gains
-from heliograph.learning.likelihood.joint import joint_world
+from heliograph.model.channel import Channel, parallel
+from heliograph.model.clock import joint_sensor
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, first
-from heliograph.model.sensor import is_linear
+from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.same import same
 from heliograph.numerics.small_matrix import solve
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
+from heliograph.random_affine.noise import Independent
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+
+def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
+    """Plant, sensor and channel of all nodes together, in their order, as if no observed loss ever happened.
+
+    Raises:
+        ValueError: relays that filter and forward, several nodes of which one varies over time.
+    """
+    if network.relays is not None:
+        raise fail("network to be learned", "nodes that hear sensors through channels", "relays that filter")
+    if network.common is not None:
+        return network.plant, network.common.sensor, _joint_channel(network.common.channel)
+    nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
+    if len(nodes) == 1:
+        return network.plant, nodes[0].sensor, _joint_channel(nodes[0].channel)
+    if any(isinstance(part, OverTime) for node in nodes for part in (node.sensor, node.channel)):
+        raise fail("network to be learned", "one node, where its sensor or channel varies over time", len(nodes))
+    sensors = {name: first(node.sensor) for name, node in zip(network.names, nodes, strict=True)}
+    return network.plant, _joined(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
+
+
+def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
+    parts = [sensor for sensor in sensors.values() if isinstance(sensor, LinearSensor)]
+    if len(parts) < len(sensors):
+        return joint_sensor(sensors)
+    matrices = [part.matrix for part in parts]
+    outputs = [f"{name}_{output}" for name, part in zip(sensors, parts, strict=True) for output in part.outputs]
+    return LinearSensor(library(matrices).concatenate(matrices), Independent([part.noise for part in parts]), outputs)
+
+
+def _joint_channel(channel: Channel) -> Channel:
+    """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
+    if first(channel).remembers or not first(channel).erases:
+        return channel
+    if isinstance(channel, OverTime):
+        return over_time([arrived(item) for item in unstack(channel)])
+    return arrived(channel)
+
 
 Form = Literal["linear", "conditional"]
 
@@ -43,12 +87,12 @@ class Data(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Whether everything arrived, and nothing was put in."""
+        """True if everything arrived, and there are no inputs."""
         return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
 class Evaluation(NamedTuple):
-    """At points of the line: log-likelihoods and scores of each step, and the Gauss-Newton information of both halves.
+    """Log-likelihoods and scores of each step at points of the line, and the Gauss-Newton information of both halves.
 
     Shapes: density (points, recordings, steps), score (points, recordings, steps, p), halves (points, 2, p, p).
     """
@@ -59,12 +103,12 @@ class Evaluation(NamedTuple):
 
     @property
     def information(self) -> Float[np.ndarray, "points p p"]:
-        """The Gauss-Newton information of all data."""
+        """Gauss-Newton information of all data."""
         return np.asarray(self.halves.sum(axis=1))
 
     @property
     def late(self) -> Float[np.ndarray, "points p p"]:
-        """The information of the second half, to which the initial state adds nothing."""
+        """Information of the second half, to which the initial state adds nothing."""
         return np.asarray(self.halves[:, 1])
 
     @property
@@ -80,15 +124,21 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The filter of one form, from numbers on the line. Equal ones share a compiled program.
+    """Filter of one form, as a function of numbers on the line. Equal ones share a compiled program.
 
-    settles: it is a `LinearFilter` of which nothing varies over time. random: so are gains. A function may read numbers
-    that live outside of it; that these are others now is seen by the network that it returns at the start.
+    A function may read numbers that live outside of it; a change of these shows in the network that it returns at the
+    start.
+
+    Args:
+        description: the network with its free numbers.
+        form: "linear" or "conditional".
+        steady: true for a `LinearFilter` of which nothing varies over time, so that its gains reach a steady state.
+        random: true if gains are random, so that gains of the filter depend on the state's second moment.
     """
 
     description: Description
     form: Form
-    settles: bool
+    steady: bool
     random: bool
 
     def __eq__(self, other: object) -> bool:
@@ -101,11 +151,11 @@ class Objective:
         return self.form, self.description, self.description.start
 
     def filter(self, x: Array) -> AbstractFilter:
-        """The filter at a point of the line."""
+        """Filter at a point of the line."""
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """z less what is expected (steps, m), NaN where nothing arrived, and its covariance (steps, m, m)."""
+        """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
         item = self.filter(x)
 
         def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
@@ -121,18 +171,18 @@ class Objective:
 
 
 def objectives(network: Description) -> list[Objective]:
-    """Those that the network allows, the linear one first.
+    """Objectives that the network allows, the linear one first.
 
-    Linear: the spread of a random gain by the state's own moments, for linear plants; its score has mean zero whatever
-    the laws. Conditional: by what is known of the state, for channels that neither remember nor are late. Without a
+    Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
+    whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
     random gain both are the same, the first.
 
     Raises:
         ValueError: a network whose likelihood no filter here knows.
     """
     built = network.start
-    forms, settles = forms_of(built), _settles(built)
-    return [Objective(network, form, settles and form == "linear", len(forms) > 1) for form in forms]
+    forms, steady = forms_of(built), _is_steady(built)
+    return [Objective(network, form, steady and form == "linear", len(forms) > 1) for form in forms]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -149,15 +199,15 @@ def forms_of(network: Network) -> list[Form]:
     return ["linear", "conditional"]
 
 
-def _settles(network: Network) -> bool:
-    """Whether the linear filter is one that neither remembers nor waits, and nothing varies over time."""
+def _is_steady(network: Network) -> bool:
+    """Decide whether the linear filter is one without memory or delay, of which nothing varies over time."""
     world = joint_world(network)
     item = first(world[2])
     return not item.remembers and not item.past and not any(isinstance(part, OverTime) for part in world)
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
-    """The filter that hears all that the network's nodes hear, whose likelihood is of this form."""
+    """Filter of all that the network's nodes receive, whose likelihood is of this form."""
     plant, sensor, channel = joint_world(network)
     if form == "linear":
         return linear_filter(plant, sensor, channel)
@@ -167,11 +217,11 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
     """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
 
-    Where gains settle, one at a time: there is enough to do side by side within a recording.
+    Where gains reach a steady state, one at a time: there is enough to do in parallel within a recording.
     """
     every: dict[int, Evaluation] = {}
     with jax.enable_x64(True):
-        for i, point in enumerate(x if objective.settles and data.plain else ()):
+        for i, point in enumerate(x if objective.steady and data.plain else ()):
             result, converged = to_numpy(_with_steady_gains(objective, point, data.measurements))
             if converged:
                 every[i] = result
@@ -197,7 +247,7 @@ def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evalua
 
     item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
     slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
-    assert isinstance(item, LinearFilter)  # the objective settles
+    assert isinstance(item, LinearFilter)  # as of every steady objective
     received, derivatives, converged = steady_gains.innovations(item, slopes, z, objective.random)
     scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
     result = Evaluation(
@@ -207,13 +257,13 @@ def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evalua
 
 
 def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """At one point: (recordings, steps), (recordings, steps, p), (2, p, p)."""
+    """Evaluation at one point: density (recordings, steps), score (recordings, steps, p), halves (2, p, p)."""
     result = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
     return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """Of one recording: density (steps,), score (steps, p) and information (2, p, p).
+    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p).
 
     s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
     components that arrived; derivatives run forward through the scan.
@@ -229,11 +279,13 @@ def _scored(
     p, steps, m = de.shape
     e, z, s = e.T, z.T[:m], jnp.moveaxis(s, 0, -1)  # time last, as the kernels of small matrices want it
     de, ds = jnp.moveaxis(de, (0, 1), (1, 2)), jnp.moveaxis(ds, (0, 1), (2, 3))
+    # components that arrived, and the log-density of their innovation
     present = ~jnp.isnan(e)
     both = present[:, None] & present
     density = log_density(e, s, jnp.abs(z) + jnp.abs(z - e))
     e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
     de, ds = jnp.where(present[:, None], de, 0.0), jnp.where(both[:, :, None], ds, 0.0)
+    # S^-1 (e, de, dS) by one factorisation, then score and information
     right = jnp.concatenate([e[:, None], de, jnp.reshape(jnp.swapaxes(ds, 1, 2), (m, p * m, steps))], axis=1)
     solved = solve(s, right)
     w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m, steps)  # S^-1 (e, de, dS)

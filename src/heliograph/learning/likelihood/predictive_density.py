@@ -1,4 +1,4 @@
-"""How likely a recording is when laws of gains count in full, not by two moments alone, and whether that fits."""
+"""Likelihood of a recording with the laws of gains in full, not by two moments alone, and a test of its fit."""
 
 from typing import NamedTuple
 
@@ -19,9 +19,9 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.erasure import arrived
 from heliograph.simulation.likelihood import rows
 
 NODES = 64  # values of each law: a hop's density to three digits where its noise is a tenth of its spread
@@ -30,19 +30,19 @@ ROWS = 256  # steps whose densities are computed at once
 
 @readable
 class Predictive(NamedTuple):
-    """What a law says of each step, given the steps before.
+    """Predictive density of each measurement, given the steps before, under a law of the gains.
 
-    log_likelihood: log p(what arrived), 0 where nothing did. pit: P(less than what arrived) of each component given
-    those before it, uniform and independent where the law is right; NaN where it did not arrive.
-
-    Shapes: log_likelihood (steps,), pit (steps, received).
+    Args:
+        log_likelihood: log p of what arrived (steps,); 0 where nothing did.
+        pit: probability integral transform, P(less than what arrived) of each component given those before it (steps,
+            received): uniform and independent where the law is right; NaN where the component did not arrive.
     """
 
     log_likelihood: Float[np.ndarray, " steps"]
     pit: Float[np.ndarray, "steps received"]
 
     def uniform(self) -> tuple[float, float]:
-        """Kolmogorov's distance of all pits from the uniform law, and its p-value if the law is right.
+        """Test all transforms for uniformity: Kolmogorov's distance, and its p-value if the law is right.
 
         Raises:
             ValueError: nothing arrived.
@@ -58,18 +58,24 @@ def predictive(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: AbstractRandomAffine,
-    measurements: ArrayLike,
-    inputs: ArrayLike | None = None,
+    measurements: "Float[ArrayLike, 'steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
     nodes: int = NODES,
 ) -> Predictive:
     """Density of each measurement with the laws of the channel's gains as `nodes` values each.
 
     p(z_k | past) = sum_j w_j N(z; G_j y + c_j, G_j P_y G_j' + N_j), where y and P_y are what the cubature filter that
     knows the channel's moments expects of the sensor, and j runs over the combinations of gains. Parts of a stack are
-    heard one after another: y and P_y are corrected by each, moments matched. Told losses say nothing. Nominal, as the
-    filter is: its prior is taken for Gaussian.
+    used one after another: y and P_y are corrected by each, moments matched. Observed losses carry no information.
+    Nominal, as the filter is: its prior is taken for Gaussian.
 
-    Shapes: measurements (steps, received), inputs (steps, inputs).
+    Args:
+        plant: the plant, which does not vary over time.
+        sensor: the sensor, which does not vary over time.
+        channel: the channel, without memory.
+        measurements: z (steps, received), NaN where a component did not arrive.
+        inputs: inputs of the plant (steps, inputs); a plant without inputs needs none.
+        nodes: number of values of each law, 64 by default.
 
     Raises:
         ValueError: a channel that remembers or varies over time, too many combinations of gains in one part, data of
@@ -88,7 +94,7 @@ def predictive(
 
 
 class Part(NamedTuple):
-    """What one part of a stack can be: arrays over the combinations of its gains and noises.
+    """Part of a stack as arrays over the combinations of its gains and noises.
 
     Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
     """
@@ -100,7 +106,7 @@ class Part(NamedTuple):
 
 
 class Parts(tuple[Part, ...]):
-    """The parts of a channel, from the first output to the last."""
+    """Parts of a channel, from the first output to the last."""
 
     @staticmethod
     def of(channel: AbstractRandomAffine, nodes: int) -> "Parts":

@@ -15,16 +15,17 @@ FEWEST = 10  # numbers that arrived for each free one
 
 
 def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[ArrayLike] | None, free: int) -> Data:
-    """All recordings, checked against the network.
+    """Gather all recordings, checked against the network, as `Data`.
 
     Raises:
-        ValueError: what a recording may not be: of other shapes, too short, without any change.
+        ValueError: recordings of other shapes, too short, or without any change.
     """
     several = (
         recording if isinstance(recording, list | tuple) and not hasattr(recording, "measurements") else [recording]
     )
     if not len(several):
         raise fail("recordings", "at least one", "none")
+    # every run of every recording, then all filled up to the longest
     parts = [part for i, item in enumerate(several) for part in _parts(network, item, _inputs_of(inputs, i, several))]
     for z, _ in parts:
         network.check_horizon(len(z))
@@ -50,12 +51,14 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
     held = getattr(recording, "measurements", recording)
     local = getattr(recording, "inputs", None) if inputs is None else inputs
+    # measurements by node
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
             raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
         held = {network.names[0]: held}
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
+    # each run: the nodes' columns side by side, and the inputs
     runs = _runs([np.asarray(held[name]) for name in network.names])
     results = []
     for run in runs:
@@ -73,14 +76,14 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
 
 
 def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """The runs of a simulation one by one; a recording is one."""
+    """Runs of a simulation one by one; a recording is one."""
     if all(value.ndim == 3 for value in values):
         return [list(item) for item in zip(*values, strict=True)]
     return [values]
 
 
 def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Rows added up to a length: of a filler, or of the last one."""
+    """Array with rows added up to a length: of a filler, or copies of the last one."""
     more = length - len(values)
     end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
     return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values

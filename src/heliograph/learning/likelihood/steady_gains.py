@@ -1,8 +1,8 @@
-"""Innovations of a linear filter over complete data, with derivatives: gains until they settle, then means in chunks.
+"""Innovations of a linear filter over complete data, with derivatives: gains to their steady state, means in chunks.
 
-Where nothing varies over time the covariance follows a recursion of its own, which comes to rest; from there on gain
-and innovation covariance are constant. Given the gains the mean is linear in its start and in the data, so that time is
-cut into chunks that run side by side, each from every unit vector and from nothing, and are joined afterwards: about
+Where nothing varies over time the covariance follows a recursion without data, which converges; from there on gain
+and innovation covariance are constant. Given the gains the mean is linear in its start and in the data, so that time
+is cut into chunks that run in parallel, each from every unit vector and from zero, and are joined afterwards: about
 2 sqrt(T) steps in a row in place of T.
 """
 
@@ -19,13 +19,13 @@ from heliograph.filters.linear.plan import Plan, followed
 from heliograph.numerics.small_matrix import times
 from heliograph.numerics.types import Array, Float, PyTree
 
-PART = 1 / 20  # of all steps, within which gains have to settle, or nothing is gained
+PART = 1 / 20  # of all steps, within which gains have to become constant, or nothing is gained
 FEWEST = 100  # the same where that is fewer
 STILL = 4e-15  # of a variance: a step that changes moments by less changes them by rounding alone
 
 
 class Innovations(NamedTuple):
-    """z less what is expected, and its covariance.
+    """Innovations z - E z, and their covariances.
 
     Shapes: value (recordings, steps, m), covariance (steps, m, m).
     """
@@ -35,7 +35,7 @@ class Innovations(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """The matrices of a step, and gains (steps, n, m) and innovation covariances (steps, m, m) of all."""
+    """Matrices of a step, and gains (steps, n, m) and innovation covariances (steps, m, m) of all."""
 
     plan: Plan
     gain: jax.Array
@@ -43,7 +43,7 @@ class Gains(NamedTuple):
 
 
 class _SteadyIteration(NamedTuple):
-    """State, matrices, what has to come to rest, and gains so far: each with its derivatives, p in front."""
+    """Iteration's state, matrices, moments that have to converge, and gains so far, with derivatives (p, ...)."""
 
     step: jax.Array
     moving: jax.Array
@@ -56,12 +56,16 @@ class _SteadyIteration(NamedTuple):
 def innovations(
     item: LinearFilter, slopes: PyTree, z: Float[Array, "recordings steps m"], random: bool
 ) -> tuple[Innovations, Innovations, jax.Array]:
-    """Of a filter without inputs of which nothing varies over time, with derivatives (p, ...) along p directions.
+    """Innovations of a filter without inputs of which nothing varies over time, with their derivatives (p, ...).
 
-    Third: whether the gains settled in time; the others are wrong if not.
+    The third result says whether the gains reached their steady state in time; the others are wrong if not.
 
-    `slopes`: those of the filter's arrays, None for others. `random`: its gains are, and hang on the state's own
-    moments; where they are known those may grow without end.
+    Args:
+        item: the filter.
+        slopes: derivatives of its arrays, None for what is no array.
+        z: measurements (recordings, steps, m), complete.
+        random: true if gains of the channel are random: the filter's gains then depend on the state's second moment.
+            Where they are known that moment may grow without end.
     """
     gains, gain_slopes, converged = _gains(item, slopes, z.shape[1], random)
 
@@ -72,12 +76,12 @@ def innovations(
 
 
 def _along(function: Callable[..., object], primals: tuple[PyTree, ...], slopes: tuple[PyTree, ...]) -> PyTree:
-    """Value and derivatives along all directions at once."""
+    """Value and derivatives of a function in all directions at once."""
     return eqx.filter_vmap(lambda *along: eqx.filter_jvp(function, primals, along), out_axes=(None, 0))(*slopes)
 
 
 def _gains(item: LinearFilter, slopes: PyTree, steps: int, random: bool) -> tuple[Gains, Gains, jax.Array]:
-    """Step by step until the moments come to rest, the last ones from there on; whether they did in time."""
+    """Gains step by step until the moments converge, constant from there on; and whether they did in time."""
     quiet, limit = jnp.zeros(item.received), min(steps, max(int(PART * steps), FEWEST))
 
     def one_step(filter_: LinearFilter, state: LinearBelief) -> tuple[LinearBelief, Plan, list[jax.Array]]:
@@ -93,12 +97,14 @@ def _gains(item: LinearFilter, slopes: PyTree, steps: int, random: bool) -> tupl
         filled = [every.at[now.step].set(single) for every, single in zip(now.filled, _varying(plan), strict=True)]
         return _SteadyIteration(now.step + 1, ~_still(now.watched, watched), state, plan, watched, filled)
 
+    # iterate until a step changes the moments by rounding alone, or the limit is reached
     start = _along(lambda local: jax.tree.map(jnp.asarray, local.init()), (item,), (slopes,))
     shapes = jax.eval_shape(further, start)
     _, plan, watched = jax.tree.map(lambda single: jnp.full(single.shape, jnp.nan, single.dtype), shapes)
     filled = [jnp.zeros((limit, *single.shape)) for single in _varying(plan)]
     begin = _SteadyIteration(jnp.asarray(0), jnp.asarray(True), start, plan, watched, filled)
     end = jax.lax.while_loop(lambda now: now.moving & (now.step < limit), body, begin)
+    # the last gains stand for all later steps
     done = jnp.arange(limit) < end.step
     over_time = []
     for every, last in zip(end.filled, _varying(end.plan), strict=True):
@@ -120,7 +126,7 @@ def _moments(prior: LinearBelief, random: bool) -> list[jax.Array]:
 
 
 def _still(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> jax.Array:
-    """Whether a step changed moments (n, n) and their derivatives (p, n, n) by rounding alone, whatever the units."""
+    """Decide whether a step changed moments (n, n) and derivatives (p, n, n) by rounding alone, in any units."""
     result = jnp.asarray(True)
     for old, old_slope, new, new_slope in zip(*before, *after, strict=True):
         every = jnp.concatenate([new[None], new_slope])
@@ -133,10 +139,10 @@ def _still(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> jax.A
 def in_chunks(
     plan: Plan, gain: Float[jax.Array, "steps n m"], start: Float[Array, " n"], z: Float[Array, "recordings steps m"]
 ) -> Float[jax.Array, "recordings steps m"]:
-    """z less what is expected of it, for m- = F m + f, m = m- + K_k (z_k - C m- - c).
+    """Innovations for m- = F m + f, m = m- + K_k (z_k - C m- - c), in chunks of time.
 
     Chunk j starts at X = (I, 0 ... 0), a column for each recording behind the unit vectors, and ends at (Phi_j, b_j):
-    the mean at its start is s_(j+1) = Phi_j s_j + b_j, and what it heard was E_0 + E_I s_j.
+    the mean at its start is s_(j+1) = Phi_j s_j + b_j, and its innovations are E_0 + E_I s_j.
     """
     r, steps, m = z.shape
     n = len(start)
@@ -144,6 +150,7 @@ def in_chunks(
     length = -(-steps // chunks)
     received = _cut(jnp.transpose(jnp.asarray(z), (1, 2, 0)), chunks, length)  # (length, m, recordings, chunks)
     gains = _cut(gain, chunks, length)
+    # all chunks in parallel, from the unit vectors and from zero
     unit = jnp.broadcast_to(jnp.eye(n, n + r)[..., None], (n, n + r, chunks))
     drift, offset = (jnp.pad(jnp.tile(b[:, None], r), ((0, 0), (n, 0)))[..., None] for b in (plan.drift, plan.offset))
     move, output = plan.transition[..., None], plan.output[..., None]
@@ -156,6 +163,7 @@ def in_chunks(
 
     ends, missed = jax.lax.scan(step, unit, (gains, received))
 
+    # s_(j+1) = Phi_j s_j + b_j from chunk to chunk
     def join(s: jax.Array, end: jax.Array) -> tuple[jax.Array, jax.Array]:
         return end[:, :n] @ s + end[:, n:], s
 

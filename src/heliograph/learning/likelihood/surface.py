@@ -1,4 +1,4 @@
-"""The likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
+"""Likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ Watch = Callable[[Maximum], None]
 
 
 class StoppedError(Exception):
-    """Somebody stopped a climb: the best so far."""
+    """Interruption of a climb, with the best so far."""
 
     def __init__(self, best: Maximum):
         super().__init__()
@@ -28,7 +28,7 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Surface:
-    """One objective over all recordings; the points asked for last are kept, for they are often asked for again."""
+    """Objective over all recordings; the last points are cached, for they are often used again."""
 
     objective: Objective
     data: Data
@@ -36,13 +36,13 @@ class Surface:
 
     @property
     def lanes(self) -> int:
-        """Points at a time, fewer for long recordings."""
+        """Number of points evaluated together, fewer for long recordings."""
         r, t, m = self.data.measurements.shape
         p = self.objective.description.parameters.size
         return int(np.clip(ROOM // (r * t * m * (m + 2) * (p + 1)), 1, LANES))
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """All that is known at points."""
+        """Evaluation at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
         return self._last[0][1]
@@ -55,10 +55,10 @@ class Surface:
     def climb(
         self, start: Float[np.ndarray, "points p"], active: Bool[np.ndarray, "points p"], watch: Watch
     ) -> Maximum:
-        """To the top from each start.
+        """Climb to the top from each start.
 
         Raises:
-            StoppedError: with the best so far, where somebody interrupts.
+            StoppedError: with the best so far, where the user interrupts.
         """
         best: list[Maximum] = []
 
@@ -74,7 +74,7 @@ class Surface:
             raise StoppedError(best[0]) from None
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-        """-d2 l by central differences of the scores, among active coordinates; the information for the others."""
+        """Hessian of -l by central differences of the scores of active coordinates; the information for the others."""
         information: np.ndarray = self.evaluations(x[None]).information[0]
         local = np.diag(information)
         width = np.where(local > 0, DIFFERENCE / np.sqrt(np.where(local > 0, local, 1.0)), 0.0)
@@ -99,7 +99,7 @@ class Surface:
         drop: float,
         active: Bool[np.ndarray, " p"],
     ) -> float:
-        """Where the likelihood, its other active coordinates at their best, has fallen by `drop` below `top`.
+        """Find where the likelihood, its other active coordinates at their best, has fallen by `drop` below `top`.
 
         `reach`: values of the coordinate, away from its best, to begin with. Infinite where it has not fallen there.
         """
@@ -107,6 +107,7 @@ class Surface:
         others[place] = False
         inside, outside = x[place], np.nan
         low = 0.0
+        # profile at a few values, then again between the two around the crossing
         for _ in range(1 + REFINEMENTS):
             start = np.repeat(x[None], len(reach), axis=0)
             start[:, place] = reach
@@ -120,6 +121,7 @@ class Surface:
                 inside, low = reach[at - 1], fallen[at - 1]
             outside, high = reach[at], fallen[at]
             reach = np.linspace(inside, outside, len(reach) + 1)[1:]
+        # linear in the root of the fall
         if not np.isfinite(high):
             return float(outside)
         return float(inside + (outside - inside) * (np.sqrt(2 * drop) - low) / (high - low))

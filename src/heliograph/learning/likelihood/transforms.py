@@ -1,4 +1,4 @@
-"""From a number on its domain to numbers on the whole line and back: where steps are taken and intervals are made."""
+"""Transforms of a number on its domain to numbers on the whole line, where steps are taken, and back."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from heliograph.numerics.types import Array, Float, PyTree
 
 
 def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
-    """The start of a free number as unbounded ones.
+    """Transform the start of a free number to unbounded ones.
 
     Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
     by row, those on the diagonal by their logarithms.
@@ -32,7 +32,7 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
 
 
 def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """The number at a point of the line, in operations that JAX traces."""
+    """Number at a point of the line, in operations that JAX traces."""
     if domain.kind == "simplex":
         rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
         weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
@@ -51,7 +51,7 @@ def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
 
 
 def link(domain: Domain, value: PyTree) -> PyTree:
-    """The scale on which an interval of one number is symmetric."""
+    """Transform a number to the scale on which its interval is symmetric."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
     if np.isfinite(domain.low):
@@ -60,7 +60,7 @@ def link(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink(domain: Domain, value: PyTree) -> PyTree:
-    """Back from there; infinite values give the limits."""
+    """Transform back from that scale; infinite values give the limits."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
     if np.isfinite(domain.low):
@@ -69,7 +69,7 @@ def unlink(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
-    """d unlink / d value."""
+    """Derivative d unlink / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -78,7 +78,7 @@ def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def slope(domain: Domain, value: PyTree) -> PyTree:
-    """d link / d value."""
+    """Derivative d link / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -87,7 +87,7 @@ def slope(domain: Domain, value: PyTree) -> PyTree:
 
 
 def size(domain: Domain, shape: tuple[int, ...]) -> int:
-    """How many numbers on the line."""
+    """Count of numbers on the line."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":
         return count - count // shape[-1]

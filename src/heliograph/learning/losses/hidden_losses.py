@@ -1,4 +1,4 @@
-"""Losses of a link that is good or bad for a while, which nobody knows: its two-mode filter and its likelihood."""
+"""Losses of a link that is good or bad for a while, as a hidden mode: its two-mode filter and its likelihood."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
 
 STEP = 1e-20  # of the complex step, whose error is its square
-UNKNOWN, START = 2, 3  # what a run of packets can be beside arrived (0) and lost (1)
+UNKNOWN, START = 2, 3  # kinds of runs of packets, after arrived (0) and lost (1)
 
 STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells, two rates that hardly differ
     logits(0.02, 0.9, 0.05, 0.5),
@@ -20,7 +20,13 @@ STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells,
 
 
 class HiddenModeLosses(AbstractLossLaw):
-    """A hidden mode, good or bad, that fails and recovers as a chain; a packet is lost with the mode's probability.
+    """Hidden mode, good or bad, that fails and recovers as a chain; a packet is lost with the mode's probability.
+
+    Args:
+        good_loss: probability of a loss in the good mode.
+        bad_loss: probability of a loss in the bad mode.
+        fail: probability that the good mode turns bad before the next packet.
+        recover: probability that the bad mode turns good before the next packet.
 
     Source: Gilbert (1960), Elliott (1963).
     """
@@ -32,7 +38,7 @@ class HiddenModeLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object, intervals: bool = True) -> "HiddenModeLosses":
-        """Maximum likelihood from three starts, with intervals by the profile of the likelihood.
+        """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
 
         Raises:
             ValueError: what is no fates.
@@ -49,7 +55,7 @@ class HiddenModeLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """By the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        """Probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
         good, bad, fails, recovers = (share.estimate for share in self.shares().values())
         away = fails + recovers
         is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
@@ -65,7 +71,7 @@ class HiddenModeLosses(AbstractLossLaw):
         return result
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """`gilbert_elliott` of the link with each mode's losses."""
+        """Link in two modes (`gilbert_elliott`) with the losses of each."""
         good, bad = (erasure(link, 1 - share.estimate) for share in (self.good_loss, self.bad_loss))
         return gilbert_elliott(good, bad, self.fail.estimate, self.recover.estimate)
 
@@ -101,12 +107,14 @@ class Runs:
         """Log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
         item = np.ones_like(good)
+        # T' and A of each fate, and the stationary law p
         moved = _matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
         emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [item, item]}
         away = fails + recovers
         start = _matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
         parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
         scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
+        # (T' A)^length of each run, and their product
         for kind, (here, lengths, place) in self.places.items():
             if kind == START:
                 parts[:, here] = start[:, None]
@@ -120,19 +128,19 @@ class Runs:
 
 
 def _matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """(sets, 2, 2)."""
+    """Stack rows of entries (sets,) as matrices (sets, 2, 2)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _scaled(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """In units of its largest real part, and the logarithm of that."""
+    """Scale matrices by their largest real part; return them and the logarithm of the scale."""
     size = np.max(matrix.real, axis=(-2, -1))
     size = np.where(size > 0, size, 1.0)
     return matrix / size[..., None, None], np.log(size)
 
 
 def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """matrix^length for each length, scaled, and the logarithms of the scales: by the binary digits of the lengths."""
+    """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
     shape = (len(matrix), len(lengths))
     result = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
     scale, (square, square_scale) = np.zeros(shape), _scaled(matrix)
@@ -149,7 +157,7 @@ def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _product(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The product of (sets, runs, 2, 2), the last run first, scaled, and the logarithm of the scale: pair by pair."""
+    """Product of (sets, runs, 2, 2), the last run first, scaled, and the logarithm of the scale: pair by pair."""
     scale = np.zeros(len(parts))
     while parts.shape[1] > 1:
         if parts.shape[1] % 2:

@@ -1,4 +1,4 @@
-"""What a law of losses is: the probability that a packet is lost, given what became of those before it."""
+"""Laws of losses: the probability that a packet is lost, given what became of those before it."""
 
 from typing import TypeVar
 
@@ -21,22 +21,22 @@ Packets = Float[np.ndarray, " packets"]
 
 @readable
 class AbstractLossLaw(Module):
-    """A law of told losses. A subclass says `shares` and `predicted`, and `channel` where one has such losses.
+    """Law of observed losses. Subclasses define `shares`, `predicted`, and `channel` where one has such losses.
 
     The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;
     each stretch starts in the stationary law.
     """
 
     def shares(self) -> dict[str, Share]:
-        """The estimates with their intervals, by name."""
+        """Estimates with their intervals, by name."""
         raise NotImplementedError
 
     def predicted(self, fate: Packets) -> Packets:
-        """P(lost) of each packet of a stretch, given those before it."""
+        """Probability that each packet of a stretch is lost, given those before it."""
         raise NotImplementedError
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """The link with such losses, which the receiver is told of.
+        """Link with such losses, which the receiver knows of.
 
         Raises:
             ValueError: a law that no channel has.
@@ -44,7 +44,7 @@ class AbstractLossLaw(Module):
         raise fail(f"channel with {type(self).__name__}", "a law with finitely many states", "a rate that drifts")
 
     def log_likelihoods(self, fates: object) -> Packets:
-        """log P(fate | those before), packet by packet, of all stretches; NaN where the fate is unknown.
+        """Log-likelihood log P(fate | those before), packet by packet, of all stretches; NaN where the fate is unknown.
 
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
@@ -57,14 +57,19 @@ class AbstractLossLaw(Module):
 
 
 class IndependentLosses(AbstractLossLaw):
-    """Each packet is lost with one probability, whatever became of the others: `lost` of `packets`."""
+    """Independent losses: each packet is lost with the same probability, whatever became of the others.
+
+    Args:
+        lost: number of packets that were lost.
+        packets: number of packets whose fate is known.
+    """
 
     lost: int
     packets: int
 
     @staticmethod
     def fit(fates: object) -> "IndependentLosses":
-        """Count.
+        """Count losses and packets.
 
         Raises:
             ValueError: what is no fates.
@@ -73,24 +78,24 @@ class IndependentLosses(AbstractLossLaw):
         return IndependentLosses(int(np.nansum(known)), int(np.sum(~np.isnan(known))))
 
     def shares(self) -> dict[str, Share]:
-        """k / n with Wilson's interval."""
+        """Share of losses, lost / packets, with Wilson's interval."""
         return {"loss": wilson(self.lost, self.packets)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """(k + 1/2) / (n + 1): a loss is never impossible."""
+        """Probability (k + 1/2) / (n + 1) of each loss, so that none is impossible."""
         return np.full(len(fate), (self.lost + 0.5) / (self.packets + 1))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """The link behind an erasure."""
+        """Link behind an erasure."""
         return erasure(link, 1 - self.lost / self.packets)
 
 
 class MarkovLosses(AbstractLossLaw):
-    """The probability depends on what became of the last `order` packets.
+    """Losses as a Markov chain: the probability depends on what became of the last `order` packets.
 
-    counts[past] = (arrived, lost) after each past, a number whose bits are the last fates, the latest one lowest.
-
-    Shapes: counts (2^order, 2).
+    Args:
+        counts: (arrived, lost) after each past (2^order, 2); a past is a number whose bits are the last fates, the
+            latest one lowest.
     """
 
     counts: np.ndarray
@@ -113,11 +118,11 @@ class MarkovLosses(AbstractLossLaw):
 
     @property
     def order(self) -> int:
-        """Packets back that it looks."""
+        """Number of packets back on which the probability depends."""
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past)."""
+        """Shares P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past)."""
         if self.order == 1:
             (stayed, failed), (recovered, lost) = self.counts
             return {"fail": wilson(failed, stayed + failed), "recover": wilson(recovered, recovered + lost)}
@@ -125,7 +130,7 @@ class MarkovLosses(AbstractLossLaw):
         return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """(k + 1/2) / (n + 1) after the past, as far as it is known."""
+        """Probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
         past, length = _past(fate, self.order)
         result = np.zeros(len(fate))
         for known in range(self.order + 1):
@@ -136,7 +141,7 @@ class MarkovLosses(AbstractLossLaw):
         return result
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """The link in modes that are the last fates; one that was never seen is taken for even odds."""
+        """Link in modes that are the last fates; a past that was never seen is taken for even odds."""
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
             shares = self.shares()
@@ -151,7 +156,7 @@ class MarkovLosses(AbstractLossLaw):
 
 
 def _past(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """The last fates as a number, the latest lowest, and how many of them are known without a gap, `order` at most."""
+    """Last fates as a number, the latest lowest, and how many are known without a gap, `order` at most."""
     past, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
     for back in range(1, order + 1):
         before = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]

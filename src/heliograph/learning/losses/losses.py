@@ -1,30 +1,33 @@
-"""Losses learned from a recording: what each law says of them, whether they remember, and which law foretells best."""
+"""Losses learned from a recording: laws fitted, tests of their memory, drifting rates, the law that predicts best."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
+from scipy.special import expit, xlogy
+from scipy.stats import chi2, norm
 
 from heliograph.learning.long_run import mean_and_error
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
-from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses
-from heliograph.learning.losses.loss_tests import LossMemory, loss_memory
-from heliograph.learning.losses.running_losses import RunningRateLosses
+from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
+from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
 from heliograph.learning.losses.stretches import Fates, as_fates
 from heliograph.numerics.check import fail, scalar, table
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
 INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
+
 LONG = 4  # packets back that the longer of the two chains looks
 
 
 class HeldOutScores(NamedTuple):
-    """What a law says of packets that it was not fitted to.
+    """Scores of a law on packets that it was not fitted to.
 
-    log_likelihood: mean over packets, nats. gain: more than independent losses say, with its standard error, which
-    allows for correlation over time.
+    log_likelihood: mean over packets, nats. gain: difference from that of independent losses; gain_error: its standard
+    error, which allows for correlation over time.
     """
 
     log_likelihood: float
@@ -33,13 +36,41 @@ class HeldOutScores(NamedTuple):
 
 
 @readable
+class LossMemory(NamedTuple):
+    """Result of two tests of losses that are independent by assumption.
+
+    Args:
+        likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known; chi-square with
+            one degree of freedom if the losses are independent.
+        likelihood_p: its p-value.
+        runs_z: number of runs of equal fates, less what is expected, in standard deviations: negative for bursts.
+        runs_p: its two-sided p-value.
+    """
+
+    likelihood_ratio: float
+    likelihood_p: float
+    runs_z: float
+    runs_p: float
+
+    @property
+    def significant(self) -> bool:
+        """True if the likelihood ratio rejects independence at 1 %."""
+        return self.likelihood_p < 0.01
+
+
+@readable
 @dataclass(frozen=True)
 class Losses:
-    """What a recording says of losses.
+    """Losses of a recording: fitted laws, tests of memory, and how well each law predicts.
 
-    laws: fitted to all packets, by name: "independent", "markov", "markov_4", "hidden", "running". held_out: how each,
-    fitted to the earlier packets alone, foretells the later ones; empty where one part is too short. best: the name of
-    the law that foretells best, "hidden" where nothing was held out. memory: tests of independence on all packets.
+    Args:
+        packets: number of packets whose fate is known.
+        lost: number of these that were lost.
+        laws: fitted to all packets, by name: "independent", "markov", "markov_4", "hidden", "running".
+        memory: tests of independence on all packets.
+        held_out: scores of each law on the later packets, when fitted to the earlier ones alone; empty where one part
+            is too short.
+        best: name of the law that predicts best, "hidden" where nothing was held out.
     """
 
     packets: int
@@ -50,18 +81,19 @@ class Losses:
     best: str
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """The link with the losses of the law that foretells best among those that a channel can have."""
+        """Link with the losses of the law that predicts best among those that a channel can have."""
         able = [name for name in self.laws if name != RUNNING]
         name = max(able, key=lambda item: self.held_out[item].log_likelihood) if self.held_out else self.best
         return self.laws[name].channel(link)
 
 
 def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
-    """Fit four kinds of laws to told losses, test for memory, and choose by what the laws say of the later packets.
+    """Fit four kinds of laws to losses, test for memory, and choose by how well the laws predict the later packets.
 
-    `fates`: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
-    `fates_of_sequence`, `fates_by_node`, `fates_by_hop` and `fates_of_measurements` give them. `held_out`: the share of
-    the packets, the last ones, that only choose.
+    Args:
+        fates: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
+            `fates_of_sequence`, `fates_by_node`, `fates_by_hop` and `fates_of_measurements` give them.
+        held_out: share of the packets, the last ones, that are not fitted to but choose; a third by default.
 
     Raises:
         ValueError: what is no fates, a share outside [0, 1).
@@ -79,7 +111,11 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 
 
 def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict[str, Losses]:
-    """The same for each node or hop, by its name.
+    """Learn the losses of each node or hop, by its name.
+
+    Args:
+        fates: {name: fates}, as `fates_by_node` and `fates_by_hop` give them.
+        held_out: share of the packets that choose, as in `learn_losses`.
 
     Raises:
         ValueError: as `learn_losses`.
@@ -110,3 +146,105 @@ def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Hel
         gain, error = mean_and_error(item - said[INDEPENDENT])
         result[name] = HeldOutScores(float(item.mean()), gain, error)
     return result
+
+
+def loss_memory(fates: object) -> LossMemory:
+    """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
+
+    Args:
+        fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
+
+    Raises:
+        ValueError: what is no fates (see `heliograph.learning`).
+    Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
+    """
+    counts = MarkovLosses.fit(fates).counts
+    both = counts.sum(axis=0)
+    ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
+    # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
+    off, variance = 0.0, 0.0
+    for part in as_fates(fates):
+        for lost in _unbroken(part):
+            n, ones = len(lost), float(lost.sum())
+            pairs = 2 * ones * (n - ones)
+            off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
+            variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
+    z = float(off / np.sqrt(variance)) if variance > 0 else 0.0
+    return LossMemory(float(ratio), float(chi2.sf(ratio, 1)), z, float(2 * norm.sf(abs(z))))
+
+
+def _likelihood(counts: np.ndarray) -> float:
+    """Log-likelihood sum n_ab log(n_ab / n_a)."""
+    rows = counts.sum(axis=1, keepdims=True)
+    return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
+
+
+def _unbroken(fate: np.ndarray) -> list[np.ndarray]:
+    """Parts of a stretch without an unknown fate."""
+    edges = np.flatnonzero(np.isnan(fate))
+    return [part[~np.isnan(part)] for part in np.split(fate, edges) if np.any(~np.isnan(part))]
+
+
+STARTS = (logits(0.2, 0.8, 0.05), logits(0.2, 0.5, 0.3), logits(0.2, 0.95, 0.01))
+
+
+class RunningRateLosses(AbstractLossLaw):
+    """Losses whose rate drifts: P(lost) = (1 - weight) base + weight r, r <- r + step (lost - r) after a known fate.
+
+    A yardstick for the others: where it predicts as well as a hidden mode, the rate drifts. No channel has it.
+
+    Args:
+        base: rate from which r begins, and to which the probability is drawn.
+        weight: share of the running rate r in the probability.
+        step: share of the last fate in the running rate.
+    """
+
+    base: Share
+    weight: Share
+    step: Share
+
+    @staticmethod
+    def fit(fates: object, intervals: bool = True) -> "RunningRateLosses":
+        """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        parts = [part[~np.isnan(part)] for part in as_fates(fates)]
+
+        def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            share = expit(x)
+            ahead = [_ahead(part, *share) for part in parts]
+            value, slope = (
+                sum(column) for column in zip(*(_log(*a) for a in zip(parts, ahead, strict=True)), strict=True)
+            )
+            return float(value), np.asarray(slope * share * (1 - share))
+
+        top, value = maximum(likelihood, [*STARTS])
+        return RunningRateLosses(*shares_at(likelihood, top, value, intervals))
+
+    def shares(self) -> dict[str, Share]:
+        """Base, weight and step with likelihood intervals."""
+        return {name: getattr(self, name) for name in ("base", "weight", "step")}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Probability of each loss by the running rate; an unknown fate leaves it where it is."""
+        known = ~np.isnan(fate)
+        at_known = _ahead(np.append(fate[known], 0.0), *(share.estimate for share in self.shares().values()))[0]
+        return np.asarray(at_known[np.cumsum(known) - known])
+
+
+def _ahead(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
+    """P(lost) of each packet, and its derivatives (3, packets)."""
+    before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
+    keep = [1.0, step - 1.0]
+    rate = lfilter([step], keep, before)  # r - base, which starts at 0
+    by_base = lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
+    by_step = lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - rate)])[: len(lost)])
+    return base + weight * rate, np.stack([1 + weight * by_base, rate, weight * by_step])
+
+
+def _log(lost: Packets, ahead: tuple[Packets, Packets]) -> tuple[float, np.ndarray]:
+    p, slope = ahead
+    p = np.clip(p, 1e-300, 1 - 1e-16)
+    return float(np.sum(np.where(lost == 1, np.log(p), np.log1p(-p)))), slope @ ((lost - p) / (p * (1 - p)))

@@ -1,4 +1,4 @@
-"""Shares of one with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
+"""Probabilities with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
 
 from collections.abc import Callable
 from functools import cache
@@ -20,7 +20,13 @@ Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient o
 
 @readable
 class Share(NamedTuple):
-    """A probability, estimated, and the ends of its 95 % interval."""
+    """Probability with its 95 % interval.
+
+    Args:
+        estimate: the estimate.
+        low: lower end of the interval.
+        high: upper end.
+    """
 
     estimate: float
     low: float
@@ -28,7 +34,7 @@ class Share(NamedTuple):
 
 
 def wilson(hits: float, of: float) -> Share:
-    """k / n, with the shares p that |k - n p| <= 1.96 sqrt(n p (1 - p)) allows; (NaN, 0, 1) of nothing.
+    """Share k / n with Wilson's interval, |k - n p| <= 1.96 sqrt(n p (1 - p)) for its ends p; (NaN, 0, 1) of nothing.
 
     Source: Wilson, Probable inference (1927).
     """
@@ -42,7 +48,7 @@ def wilson(hits: float, of: float) -> Share:
 
 
 def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
-    """The best of the maxima found from the starts (logits), and the value there; logits stay within END.
+    """Maximise from several starts (logits); return the best point and the value there. Logits stay within END.
 
     precision: the relative change of the value at which a search ends.
     """
@@ -78,7 +84,7 @@ def _profile(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
 
 
 def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
-    """Where the profile of logit i crosses the level on one side; 0 or 1 where it does not."""
+    """Crossing of the level by the profile of logit i on one side; 0 or 1 where it does not cross."""
     others, near = np.delete(np.arange(len(top)), i), top.copy()
 
     @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
@@ -94,6 +100,7 @@ def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> f
             near[others] = free
         return best - level
 
+    # a bracket by doubled steps from the top, then Brent's method
     inside, step = float(top[i]), 0.25
     if above(inside) <= 0:
         return float(expit(inside))
@@ -105,5 +112,5 @@ def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> f
 
 
 def logits(*shares: float) -> np.ndarray:
-    """Of shares inside (0, 1)."""
+    """Logits of shares inside (0, 1)."""
     return np.asarray(logit(np.array(shares)))

@@ -1,4 +1,4 @@
-"""What became of packets: 0 arrived, 1 lost, NaN nobody knows, in stretches between which nothing is known."""
+"""Fates of packets, 0 arrived, 1 lost, NaN unknown, in stretches between which nothing is known."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -6,22 +6,27 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, check_count, fail, items, rank, table
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, Shaped
 
 Fates = list[Float[np.ndarray, " packets"]]
 
-JUMP = 200  # sequence numbers that leap so far ahead tell of a restart, not of as many losses
-COPY = 50  # a number heard again within so many is a copy
+JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
+COPY = 50  # a number received again within so many is a copy
 
 
-def fates_of_sequence(sequence: ArrayLike, sent: ArrayLike | None = None, jump: int = JUMP) -> Fates:
-    """Fates of the packets of one sender from the sequence numbers that were heard: what is missing was lost.
+def fates_of_sequence(
+    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = JUMP
+) -> Fates:
+    """Fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
 
     A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted); a copy is dropped.
     Packets that overtake each other look like restarts: with their times of sending they are put in order first, and a
     copy is what has number and time of another.
 
-    Shapes: sequence, sent (packets,).
+    Args:
+        sequence: sequence numbers in the order of arrival (packets,).
+        sent: times of sending (packets,), in any unit; none by default.
+        jump: leap ahead that means a restart; 200 by default.
 
     Raises:
         ValueError: no packet, numbers that are not whole, times of another length.
@@ -30,10 +35,12 @@ def fates_of_sequence(sequence: ArrayLike, sent: ArrayLike | None = None, jump: 
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
+    # order by time of sending where it is known
     received = numbers.astype(np.int64)
     if sent is not None:
         when = array("times of sending", sent, received.shape)
         received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
+    # a new stretch at each restart, copies dropped
     parts: list[list[int]] = [[]]
     for number in received.tolist():
         local = parts[-1]
@@ -52,11 +59,16 @@ def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:
 
 
 def fates_by_node(
-    node: Sequence[object] | np.ndarray, sequence: ArrayLike, sent: ArrayLike | None = None
+    node: "Sequence[object] | Shaped[np.ndarray, ' packets']",
+    sequence: "Float[ArrayLike, ' packets']",
+    sent: "Float[ArrayLike, ' packets'] | None" = None,
 ) -> dict[str, Fates]:
-    """The same for each sender of a log, by the sender's name.
+    """Fates of the packets of each sender of a log, by the sender's name.
 
-    Shapes: node, sequence, sent (packets,).
+    Args:
+        node: sender of each packet (packets,).
+        sequence: sequence numbers in the order of arrival (packets,).
+        sent: times of sending (packets,); none by default.
 
     Raises:
         ValueError: as `fates_of_sequence`; not one node for each number.
@@ -71,15 +83,16 @@ def fates_by_node(
     }
 
 
-def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
-    """Fates at each hop of a route, from which packets were heard behind each, in the order of the route.
+def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
+    """Fates at each hop of a route, from which packets arrived behind each, in the order of the route.
 
     A packet that was lost says nothing of the hops that it did not reach.
 
-    Shapes: each of `arrived` (packets,), true or 1 where the packet was heard behind this hop.
+    Args:
+        arrived: {hop: (packets,)}, true or 1 where the packet arrived behind this hop.
 
     Raises:
-        ValueError: no hops, other values, a packet heard behind a hop but not before it.
+        ValueError: no hops, other values, a packet that arrived behind a hop but not before it.
     """
     if not table("arrivals by hop", arrived, "arrays"):
         raise fail("arrivals by hop", "at least one hop", "none")
@@ -89,6 +102,7 @@ def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
         received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
         if np.any((received != 0) & (received != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
+        # a packet has a fate at a hop if it passed the hop before
         before = np.ones(len(received)) if before is None else before
         if np.any(received > before):
             packet = int(np.argmax(received > before))
@@ -100,13 +114,14 @@ def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
     return result
 
 
-def fates_of_measurements(measurements: Mapping[str, ArrayLike]) -> dict[str, Fates]:
-    """Fates of what each node of a recording should have heard at each step: NaN was lost, and the node was told.
+def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *received']]") -> dict[str, Fates]:
+    """Fates of what each node of a recording should have received at each step, where NaN is a loss.
 
-    Components of a node that come and go together are one packet, under the node's name; else each has its own,
-    NODE.0, NODE.1, ... A component that never arrived was not sent.
+    Components of a node that come and go together are one packet, under the node's name; else each has a name of its
+    own, NODE.0, NODE.1, ... A component that never arrived was not sent.
 
-    Shapes: measurements[node] (steps, received).
+    Args:
+        measurements: {node: (steps, received)} or (steps,), NaN where a component did not arrive.
 
     Raises:
         ValueError: no table of numbers.
@@ -126,7 +141,7 @@ def fates_of_measurements(measurements: Mapping[str, ArrayLike]) -> dict[str, Fa
 
 
 def as_fates(value: object) -> Fates:
-    """One stretch of fates, or several.
+    """Check and list stretches of fates, given one or several.
 
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.

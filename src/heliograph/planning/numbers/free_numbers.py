@@ -39,7 +39,7 @@ class Numbers(NamedTuple):
 
     @property
     def start(self) -> Vector:
-        """Where a search begins."""
+        """Start of a search."""
         return np.concatenate([number.start.ravel() for number in self.by_name.values()])
 
     @property

@@ -31,8 +31,9 @@ Numbers = Any  # NumPy's or JAX's, as what they are made of
 
 
 class ModeSystem(NamedTuple):
-    """Of each step A, Q, the chain T into it, the law pi, by mode H and N of z = H x + n, and the transmitted powers.
+    """System of the best linear filter at each step, by mode where the receiver observes modes.
 
+    x+ = A x + w, Cov w = Q; T the chain into the step and pi its law; z = H x + n, Cov n = N by mode; the powers sent.
     start: the covariance before the first step; None where the steps repeat for ever.
     """
 
@@ -105,7 +106,7 @@ def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
 
 
 def _initial(m: ModeSystem) -> Float[np.ndarray, "M n n"]:
-    """X before the first step, over which the chain forgets."""
+    """X before the first step, over which the chain has no memory."""
     modes = m.law.shape[1]
     parts: np.ndarray = m.start[None] * (np.ones((modes, 1, 1)) / modes)
     return parts
@@ -151,7 +152,7 @@ def _adjoint(m: ModeSystem, loops: Parts, weights: Float[np.ndarray, "time n n"]
     terms = [np.tile(weight, (modes, 1, 1)).ravel() for weight in weights]
 
     def backwards(after: np.ndarray) -> list[np.ndarray]:
-        """What later steps add to L of the last, ..., the first step, and to that of the last before."""
+        """Sums that later steps add to L of the last, ..., the first step, and to that of the last before."""
         result = [after]
         for k in range(steps - 1, -1, -1):
             result.append(back[k] @ (terms[k] + result[-1]))

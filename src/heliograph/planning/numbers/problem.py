@@ -113,7 +113,7 @@ class Point(NamedTuple):
 
     @property
     def powers(self) -> Float[np.ndarray, "time hops"]:
-        """What each transmitter sends."""
+        """Powers that the transmitters send."""
         return np.asarray(self.system.powers)
 
 

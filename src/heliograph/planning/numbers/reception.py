@@ -46,7 +46,7 @@ class Source(NamedTuple):
 
 
 class Received(NamedTuple):
-    """At each step the chain into it, its law, H = E[G] C and the noise N by mode, and the transmitters' powers."""
+    """Chain into each step, its law, H = E[G] C and noise N by mode, and the transmitters' powers."""
 
     chain: Float[Array, "time M M"]
     law: Float[Array, "time M"]
@@ -155,7 +155,7 @@ def _stacked(nodes: list[Received]) -> tuple[Array, Array]:
 def received(
     name: str, source: Source, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
 ) -> Received:
-    """What a node receives of states with E (x, 1)(x, 1)', in steps that repeat `forever` or begin with the first.
+    """Describe a node's reception of states with E (x, 1)(x, 1)'; steps repeat `forever` or begin with the first.
 
     Raises:
         ValueError: a channel with memory whose mode is not observed.
@@ -183,7 +183,7 @@ def received(
 
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
-    """Whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
+    """Decide whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
     return all(has_known_mean(second_order(map_)) for map_ in _observed_modes(name, channel).maps)
 
 
@@ -199,7 +199,7 @@ def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 
 
 def _flagged(name: str, channel: AbstractRandomAffine) -> JointModes:
-    """What arrives in each mode of a channel all of whose modes are observed."""
+    """Modes of a channel all of whose modes are observed, with the map in each."""
     parts = channel.maps if isinstance(channel, Stack) else ()
     rest = [part for part in parts if not isinstance(part, ModeOutput)]
     chains = memories(channel)

@@ -83,7 +83,7 @@ class PathProblem(NamedTuple):
         return low
 
     def solve(self, starts: list[Powers], target: float | None = None) -> Powers | None:
-        """Best powers found from these starts, for the least error or for the least total that reaches a target."""
+        """Best powers from these starts, for the least error or for the least total that reaches a target."""
         rows, most = self.limits.rows()
         peak = self.limits.peak
         problem = Problem(
@@ -108,7 +108,7 @@ class PowerTask(NamedTuple):
 
     @property
     def convex(self) -> bool:
-        """Whether no path has two free hops: then j is concave in its power, and the error convex."""
+        """True if no path has two free hops; then j is concave in its power, and the error convex."""
         return is_convex(self.problem.path)
 
     def whole(self) -> SplitPaths:
@@ -134,14 +134,14 @@ class PowerTask(NamedTuple):
         )
 
     def of_paths(self, powers: Powers) -> Float[np.ndarray, "time path"]:
-        """What the free hops of each path send together."""
+        """Power that the free hops of each path send together."""
         total = np.zeros(self.problem.paths.second.shape)
         np.add.at(total.T, self.problem.path, powers.T)
         return total
 
 
 def is_convex(path: Int[np.ndarray, "free"]) -> bool:
-    """Whether no two free hops are on the same path."""
+    """Decide whether no two free hops are on the same path."""
     return len(set(path.tolist())) == len(path)
 
 
@@ -176,7 +176,7 @@ def power_task(
 
 
 def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
-    """Which paths send at which step: all at first; every choice if `starts` allow, else drawn ones. One if convex."""
+    """Masks of the paths that send at each step: all, then every choice or `starts` drawn ones; one mask if convex."""
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
         return [whole]
@@ -193,7 +193,7 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
 
 
 def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
-    """Powers of the least error found within the limits."""
+    """Powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         whole = SplitPaths(*(part[:, problem.path] for part in task.whole()))
@@ -211,7 +211,7 @@ def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
 
 
 def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
-    """Powers of the least total found that reaches the target error."""
+    """Powers of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
     limits = task.problem.limits
     free_total = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))

@@ -49,15 +49,15 @@ class PathInformation(NamedTuple):
 
 
 def independent_paths(
-    transition: ArrayLike,
-    process: ArrayLike,
-    rows: ArrayLike,
-    noises: ArrayLike,
-    kappa: ArrayLike,
-    alpha: ArrayLike,
+    transition: "Float[ArrayLike, 'n n']",
+    process: "Float[ArrayLike, 'n n']",
+    rows: "Float[ArrayLike, 'M n']",
+    noises: "Float[ArrayLike, ' M']",
+    kappa: "Float[ArrayLike, '...']",
+    alpha: "Float[ArrayLike, '...']",
     error: Error | None = None,
-    initial_mean: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
     names_: tuple[str, ...] | None = None,
 ) -> Paths:
     """Paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.

@@ -78,6 +78,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     match channel:
         case GainAndNoise() if not transmits(channel):  # a wire passes each number on
             return [Chain(row, {}) for row in np.asarray(channel.matrix) @ rows]
+        # a stack holds chains; a series is a chain once its wires are multiplied out
         case Stack():
             parts = enumerate(channel.maps, 1)
             return [chain for i, part in parts for chain in chains_of(part, rows, f"{prefix}part{i}.")]

@@ -57,7 +57,7 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
     return SplitPaths(np.minimum(full, DEAD), paths.signal, alpha)
 
 
-def split_power(alpha: ArrayLike, total: ArrayLike) -> Float[np.ndarray, "H"]:
+def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
     """Powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a relay chain least.
 
     p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with the multiplier l that the sum sets. Plant, sensor and

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps, check_forgets
 from heliograph.random_affine.moments.moments import Moments
 from heliograph.random_affine.moments.monomials import (
     count,
@@ -19,7 +19,7 @@ from heliograph.random_affine.moments.monomials import (
 )
 
 
-class Lift(AbstractRandomAffine):
+class Lift(AbstractWithBase):
     """Lift of a map to monomials: from those of y of degree 1 to `degree` to those of z; degree 2 is the square.
 
     Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of
@@ -50,10 +50,6 @@ class Lift(AbstractRandomAffine):
         """Monomials of y of degree 1 to `degree`."""
         return count(self.base.inputs + 1, self.degree) - 1
 
-    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the base map."""
-        return self.base.init(key)
-
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw Sym^degree(H)."""
         state, h = self.base.draw(state, key)
@@ -68,18 +64,6 @@ class Lift(AbstractRandomAffine):
         refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
         repetitions = np.bincount(columns)
         return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
-
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Lifts of the base map's extremes."""
-        return tuple(Lift(m, self.degree) for m in self.base.extremes())
-
-    def corner_count(self) -> int:
-        """Count of the base map."""
-        return self.base.corner_count()
-
-    def mean_gain(self) -> AbstractRandomAffine:
-        """Lift of the base map with its mean gain."""
-        return Lift(self.base.mean_gain(), self.degree)
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """A lifted point: the monomials of an input of the base map."""

@@ -6,7 +6,7 @@ Sym^k(H) of a homogeneous matrix H takes the monomials of Y to those of Z = H Y,
 
 from functools import cache
 from itertools import combinations_with_replacement, product
-from math import comb, factorial, prod
+from math import comb, prod
 from typing import Any
 
 import numpy as np
@@ -148,8 +148,3 @@ def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.nda
             terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
     row_, column, noise, weight_ = np.array(terms, dtype=np.int64).T
     return row_, column, noise, weight_
-
-
-def multinomial(powers: Exponents) -> int:
-    """Number of orderings of a monomial's factors: (sum a)! / prod a!."""
-    return factorial(sum(powers)) // prod(factorial(a) for a in powers)

@@ -9,9 +9,7 @@ from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage,
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
-from heliograph.serving.brokers.partition import WHOLE, Part, word
-from heliograph.serving.brokers.retry import LOG, LONGEST
-from heliograph.serving.brokers.transport import Batch
+from heliograph.serving.brokers.transport import LOG, LONGEST, WHOLE, Batch, Part, word
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 

@@ -23,9 +23,7 @@ from nats.js.api import (
 from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
-from heliograph.serving.brokers.partition import WHOLE, Part, word
-from heliograph.serving.brokers.retry import Retry, still_needed
-from heliograph.serving.brokers.transport import Batch, TakenOverError
+from heliograph.serving.brokers.transport import WHOLE, Batch, Part, Retry, TakenOverError, still_needed, word
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 

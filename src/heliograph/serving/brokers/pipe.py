@@ -4,7 +4,7 @@ import asyncio
 import os
 from collections.abc import Callable, Sequence
 
-from heliograph.disk.durable import naming
+from heliograph.disk.whole_file import naming
 from heliograph.serving.brokers.transport import Batch, nothing
 from heliograph.serving.message import LONGEST
 from heliograph.serving.output import Output

@@ -1,9 +1,20 @@
-"""Interface of a transport: how messages reach a service and outputs leave it."""
+"""Transports of messages: their interface, the one of a broker, partitions of plants, attempts with waits that grow.
 
+A broker that hands each message to whichever process is free (a shared subscription of MQTT 5, a consumer with many
+readers) would spread a plant over processes. So the plants are cut into a fixed number of parts, and a part is read by
+one process at a time. The hash is FNV-1a of 32 bits modulo the number of parts, since that is what a NATS server
+computes itself; a sender to MQTT writes the part into the topic.
+"""
+
+import asyncio
+import logging
+import random
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
+from urllib.parse import quote
 
-from heliograph.numerics.check import InputError
+from heliograph.numerics.check import InputError, check_count, text
+from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 
 
@@ -17,10 +28,6 @@ class Batch(NamedTuple):
 
     payloads: Sequence[bytes]
     acknowledge: Callable[[], Awaitable[None]]
-
-
-class TakenOverError(InputError):
-    """Loss of the messages to another process, which reads them now."""
 
 
 class Transport(Protocol):
@@ -39,5 +46,94 @@ class Transport(Protocol):
         """Release the resources of the transport."""
 
 
+class Part(NamedTuple):
+    """One part of the plants: its `number`, counted from 0, and the number of parts, `of`."""
+
+    number: int = 0
+    of: int = 1
+
+
+WHOLE = Part()
+
+
+def connected(address: Address, part: Part = WHOLE) -> Transport:
+    """Return the transport for one part of the plants through the broker at this address.
+
+    Args:
+        address: the broker; its `kind`, mqtt or nats, selects the protocol.
+        part: the part of the plants whose messages are read; by default all.
+    """
+    if address.kind == "mqtt":
+        from heliograph.serving.brokers.mqtt import Mqtt
+
+        return Mqtt(address, part)
+    from heliograph.serving.brokers.nats import Nats
+
+    return Nats(address, part)
+
+
+class TakenOverError(InputError):
+    """Loss of the messages to another process, which reads them now."""
+
+
 async def nothing() -> None:
     """Acknowledge to a sender that expects no answer."""
+
+
+LOG = logging.getLogger("heliograph.serving")
+
+FIRST, LONGEST = 0.25, 30.0  # seconds
+
+
+def still_needed() -> None:
+    """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+class Retry:
+    """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
+
+    def __init__(self, what: str):
+        self.what, self._wait = what, FIRST
+
+    async def wait(self, error: Exception) -> None:
+        """Log the failure, and wait before the next attempt."""
+        still_needed()
+        wait = self._wait * random.uniform(0.5, 1.0)
+        LOG.warning("%s: %s; trying again in %.1f s", self.what, type(error).__name__, wait)
+        self._wait = min(2 * self._wait, LONGEST)
+        await asyncio.sleep(wait)
+
+    def worked(self) -> None:
+        """Reset the wait after a success."""
+        self._wait = FIRST
+
+
+OFFSET, PRIME = 0x811C9DC5, 0x01000193
+
+NAMELESS = "_"  # the word for the plant that has no name
+
+
+def word(plant: str) -> str:
+    """Encode a plant's name as one word of a topic or subject: letters, digits and hyphens stay, others become %XX."""
+    text("plant", plant)
+    return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
+
+
+def part_of(plant: str, parts: int) -> int:
+    """Return the part that a plant is in.
+
+    Args:
+        plant: name of the plant.
+        parts: number of parts, at least 1.
+
+    Returns:
+        The number of the part, 0 <= number < `parts`.
+    """
+    check_count("parts", parts)
+    value = OFFSET
+    for byte in word(plant).encode():
+        value = (value ^ byte) * PRIME & 0xFFFFFFFF
+    return value % parts

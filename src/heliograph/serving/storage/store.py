@@ -1,12 +1,27 @@
-"""Store of a service's state: plants, outputs and progress of publication, in one transaction for each batch."""
+"""Store of a service's state, in one transaction for each batch: plants, outputs, progress; rows with checksums."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from shlex import quote
 from typing import Any
+from zlib import crc32
 
-from sqlalchemy import Column, Connection, Table, delete, func, inspect, select, update
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Connection,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    delete,
+    func,
+    inspect,
+    select,
+    update,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -15,17 +30,42 @@ from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.database import engine_at
 from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
-from heliograph.serving.storage.tables import (
-    IDENTITY_TABLE,
-    JOURNAL,
-    LAYOUT,
-    NUMBERS,
-    PLANTS,
-    TABLES,
-    checksum,
-    is_named,
-    is_whole,
-)
+
+LAYOUT = "2"  # of these tables; those of layout 1 had no checksums
+TABLES = MetaData()
+PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
+               Column("body", LargeBinary), Column("checksum", BigInteger))  # fmt: skip
+JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, autoincrement=False),
+                Column("process", String(200)), Column("lines", Text), Column("checksum", BigInteger))  # fmt: skip
+NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger),
+                Column("checksum", BigInteger))  # fmt: skip
+IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
+
+
+def checksum(name: str | int, *values: str | int | bytes) -> int:
+    """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32."""
+    return (crc32(f"{name}".encode()) >> 1) << 32 | _sum(name, values)
+
+
+def is_whole(written: object, name: object, *values: object) -> bool:
+    """Return whether a row is as it was written; a damaged row may contain anything."""
+    if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
+        return False
+    return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
+
+
+def is_named(written: object, name: object) -> bool:
+    """Return whether the name of a row is as it was written, whatever became of its values."""
+    return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
+
+
+def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
+    result = crc32(f"{name}".encode())
+    for value in values:
+        data = value if isinstance(value, bytes) else f"{value}".encode()
+        result = crc32(data, crc32(f"\0{len(data)}\0".encode(), result))
+    return result
+
 
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
 IDENTITY = "identity"

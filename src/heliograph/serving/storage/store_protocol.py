@@ -1,8 +1,11 @@
-"""Interface between a service and the store of its state."""
+"""Interface between a service and the store of its state, the network's identity there, and a store in memory."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
+from heliograph.live.identity import Identity, network_identity
+from heliograph.numerics.check import instance
+from heliograph.serving.fleet import Fleet
 from heliograph.serving.output import Kind, Output
 
 
@@ -71,3 +74,45 @@ class StoreProtocol(Protocol):
 
     def close(self) -> None:
         """Release the resources of the store."""
+
+
+def identity(fleet: Fleet) -> Identity:
+    """Return what a store must agree with to continue this fleet: its network, compiled program and options.
+
+    Args:
+        fleet: the fleet whose plants the store keeps.
+    """
+    instance("fleet", fleet, Fleet, "a Fleet")
+    return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict())
+
+
+class InMemoryStore:
+    """Store that numbers outputs and keeps nothing; the plants stay in the memory of the service."""
+
+    keeps, name = False, "memory"
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
+        """Return no plants: none are stored."""
+        return {}
+
+    def commit(
+        self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
+    ) -> list[Output]:
+        """Number the outputs, counting from 1."""
+        begin = self._number + 1
+        self._number += len(entries)
+        return [entry.numbered(number) for number, entry in enumerate(entries, begin)]
+
+    def unpublished(self) -> list[Output]:
+        """Return no outputs: none are stored."""
+        return []
+
+    def count(self) -> int:
+        """Return 0: no plants are stored."""
+        return 0
+
+    def close(self) -> None:
+        """Do nothing: the store holds no resources."""

@@ -32,8 +32,8 @@ from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
 

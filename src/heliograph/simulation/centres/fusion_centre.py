@@ -6,13 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import Knowledge, begin, fused_estimate, moved, receive_reports
 from heliograph.fusion.cross_covariance import Errors
 from heliograph.fusion.report_link import Links
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -29,7 +29,7 @@ class CentreState(NamedTuple):
     known: Knowledge
 
 
-class CentreFilter(AbstractFilter):
+class CentreFilter(AbstractSizedFilter):
     """Filter form of `AllReports`, whose measurement is the reports: for streams, recordings and simulated runs.
 
     The measurement is, for each age in steps and each node in turn, the part of the report that arrived: NaN for a
@@ -43,10 +43,6 @@ class CentreFilter(AbstractFilter):
     ages: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)
     quantized: bool = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> CentreState:

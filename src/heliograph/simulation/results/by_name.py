@@ -37,6 +37,15 @@ def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str,
     return {name: received[name] for name in network.names}
 
 
+def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    return {
+        name: np.asarray(node_group)[..., i, :]
+        for group, node_group in groups.items()
+        for i, name in enumerate(network.groups[int(group)])
+    }
+
+
 def by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:

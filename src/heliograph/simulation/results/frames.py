@@ -1,20 +1,18 @@
-"""Results as tables: a record as a wide one and back, statistics as a summary."""
+"""A record as a wide table, and back."""
 
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from heliograph.model.estimate import STRENGTH, Claim, Estimate
 from heliograph.numerics.check import fail
+from heliograph.simulation.centres.uplinks import Uplink
 
 if TYPE_CHECKING:  # an extra
     import pandas as pd
 
     from heliograph.simulation.results.record import Record
-    from heliograph.simulation.results.statistics import ErrorStatistics
-    from heliograph.simulation.results.statistics_by_name import StatisticsByName
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
@@ -49,15 +47,12 @@ def record_frame(record: "Record") -> "pd.DataFrame":
     return frame
 
 
-def record_of_frame(frame: "pd.DataFrame") -> "Record":
-    """Record from such a table.
+def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
+    """Fields of the record of such a table.
 
     Raises:
         ValueError: no such table.
     """
-    from heliograph.simulation.centres.uplinks import Uplink
-    from heliograph.simulation.results.record import Record
-
     if list(getattr(getattr(frame, "columns", None), "names", ())) != LEVELS:
         raise fail("table", f"columns {LEVELS}, as Record.to_pandas makes them", type(frame).__name__)
     # Values by (node, filter, quantity), components along the last axis.
@@ -91,44 +86,14 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
         for name, item in sent.items()
     }
     time = np.asarray(frame.index.get_level_values("time"))[:steps]
-    return Record(time, states, joined.get(("", "", "truth")), measurements, estimates, uplinks)
-
-
-def statistics_frame(result: "StatisticsByName") -> "pd.DataFrame":
-    """Table of statistics: a row for each node and filter, with claim, runs, RMSE, NEES, and figures by state."""
-    import pandas as pd
-
-    # Failed runs stand in the row, without a warning each.
-    rows, index = [], []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the row says in how many runs it failed
-        for node, filters in result.items():
-            for name, filter_ in filters.items():
-                index.append((node, name))
-                rows.append(_summary(filter_, result.states))
-    names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
-    return pd.DataFrame(rows, index=names)
-
-
-def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
-    # Figures of all states together, then of each state.
-    nees, low, high = item.nees_per_dimension()
-    rmse, error = item.rmse()
-    # Figures of each state, after those of all together.
-    by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
-    total = {
-        "claim": "none" if item.failed_runs else item.claim,
-        "runs": item.runs,
-        "failed runs": item.failed_runs,
-        "rmse": rmse,
-        "rmse error": error,
-        "nees": nees,
-        "nees low": low,
-        "nees high": high,
+    return {
+        "time": time,
+        "states": states,
+        "truth": joined.get(("", "", "truth")),
+        "measurements": measurements,
+        "estimates": estimates,
+        "uplinks": uplinks,
     }
-    for state, single, spread, claimed in by_state:
-        total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
-    return total
 
 
 def _labels(columns: Sequence[Column]) -> Any:

@@ -145,11 +145,10 @@ def dataset_of(
     return xr.Dataset(data, coordinates, attributes)
 
 
-def claims_text(result: Any) -> str:
+def claims_text(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Claims for people: `node/filter: claim`."""
-    every = result.estimates if hasattr(result, "estimates") else result
     return visible(
-        ", ".join(f"{node}/{name}: {single.claim}" for node, item in every.items() for name, single in item.items())
+        ", ".join(f"{node}/{name}: {single.claim}" for node, item in results.items() for name, single in item.items())
     )
 
 

@@ -1,19 +1,30 @@
 """Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
-from heliograph.simulation.results.frames import record_frame, record_of_frame
-from heliograph.simulation.results.labelled import checked_units
-from heliograph.simulation.results.labelled_record import record_dataset, record_from
+from heliograph.simulation.results.frames import record_fields, record_frame
+from heliograph.simulation.results.labelled import (
+    TIME,
+    check_title,
+    claims_of,
+    claims_text,
+    dataset_of,
+    filled,
+    names_of,
+    units_of,
+    uplink_variables,
+    uplinks_from,
+    values_of,
+)
 from heliograph.simulation.results.plots import plot_record
 from heliograph.simulation.results.saved import Saved
 
@@ -21,6 +32,8 @@ if TYPE_CHECKING:  # extras
     import pandas as pd
     import xarray as xr
     from matplotlib.axes import Axes
+
+RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
 @readable
@@ -38,6 +51,8 @@ class Record(Saved):
         units: by the state's name, and of "time"; empty where they were not given.
         smoothed: record of estimates given later data too; None where these were not asked for. It is saved separately.
         reports: by fusion and node, of each fusion that uses reports.
+        transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
+            was sent, negative where it was lost, 0 where it was not sent.
     """
 
     time: np.ndarray
@@ -49,6 +64,7 @@ class Record(Saved):
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
+    transmissions: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
@@ -56,15 +72,6 @@ class Record(Saved):
         means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
         every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
         return len(every[0]) if every and every[0].ndim == 3 else None
-
-    def with_units(self, units: Mapping[str, str]) -> "Record":
-        """Return the record with units, by the state's name and of "time", for files, tables and figures.
-
-        Raises:
-            ValueError: a name that is no state.
-        """
-        smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
-        return replace(self, units=checked_units(units, self.states), smoothed=smoothed)
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
@@ -94,12 +101,45 @@ class Record(Saved):
         return dict(zip(self.states, np.sqrt(squares.mean(axis=0)).tolist(), strict=True))
 
     def to_xarray(self) -> "xr.Dataset":
-        """Labelled arrays: dimensions run, time, node, filter, state; `Record.from_xarray` converts them back.
+        """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
+
+        A filter that a node does not have is NaN, and its `claim` is empty. `Record.from_xarray` converts them back.
 
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
         """
-        return record_dataset(self)
+        nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
+        filters = list(dict.fromkeys(name for estimate in self.estimates.values() for name in estimate))
+        lead, axes = (*([] if self.runs is None else [self.runs]), len(self.time)), [] if self.runs is None else ["run"]
+        n, sizes = len(self.states), (len(nodes), len(filters))
+        # Estimates and measurements with their places.
+        results = [
+            ((nodes.index(node), filters.index(name)), estimate)
+            for node, estimate_ in self.estimates.items()
+            for name, estimate in estimate_.items()
+        ]
+        received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
+        most = max((z.shape[-1] for _, z in received), default=0)
+        # Variables, NaN where a node has no such filter or component.
+        variables = {
+            "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), received)),
+            "length": (["node"], _per_node(nodes, {node: z.shape[-1] for node, z in self.measurements.items()})),
+            "estimated": (["node"], np.array([node in self.estimates for node in nodes], dtype=bool)),
+            "claim": (["node", "filter"], claims_of(sizes, results)),
+            "mean": (
+                [*axes, TIME, "node", "filter", "state"],
+                filled(lead, sizes, (n,), [(place, np.asarray(e.mean)) for place, e in results]),
+            ),
+            "covariance": (
+                [*axes, TIME, "node", "filter", "state", "other"],
+                filled(lead, sizes, (n, n), [(place, np.asarray(e.covariance)) for place, e in results]),
+            ),
+            **uplink_variables(self.uplinks, [*axes, TIME], n),
+        }
+        if self.truth is not None:
+            variables["truth"] = ([*axes, TIME, "state"], self.truth)
+        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states}
+        return dataset_of(RECORD, variables, labels, self.time, self.units, claims_text(self.estimates))
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
@@ -108,7 +148,31 @@ class Record(Saved):
         Raises:
             ValueError: no such dataset.
         """
-        return record_from(dataset)
+        check_title(dataset, RECORD)
+        lead = ["run", TIME] if "run" in dataset.dims else [TIME]
+        nodes, filters = names_of(dataset, "node"), names_of(dataset, "filter")
+        # Variables with their axes in order.
+        measurement = values_of(dataset, "measurement", [*lead, "node", "received"])
+        mean = values_of(dataset, "mean", [*lead, "node", "filter", "state"])
+        covariance = values_of(dataset, "covariance", [*lead, "node", "filter", "state", "other"])
+        claim = values_of(dataset, "claim", ["node", "filter"])
+        length, estimated = values_of(dataset, "length", ["node"]), values_of(dataset, "estimated", ["node"])
+        # Back to nodes and filters by name.
+        estimates: dict[str, dict[str, Estimate]] = {nodes[i]: {} for i in np.flatnonzero(estimated)}
+        for i, j in zip(*np.nonzero(claim != ""), strict=True):
+            moments = mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy()
+            estimates[nodes[i]][filters[j]] = Estimate(*moments, cast(Claim, str(claim[i, j])))
+        return cls(
+            time=np.asarray(dataset[TIME].values),
+            states=tuple(names_of(dataset, "state")),
+            truth=values_of(dataset, "truth", [*lead, "state"]) if "truth" in dataset else None,
+            measurements={
+                node: measurement[..., i, : length[i]].copy() for i, node in enumerate(nodes) if length[i] >= 0
+            },
+            estimates=estimates,
+            uplinks=uplinks_from(dataset, lead),
+            units=units_of(dataset),
+        )  # fmt: skip
 
     def to_pandas(self) -> "pd.DataFrame":
         """Table: a row for each time (and run), columns (node, filter, quantity, component, other).
@@ -127,12 +191,12 @@ class Record(Saved):
         Raises:
             ValueError: no such table.
         """
-        return record_of_frame(frame)
+        return cls(**record_fields(frame))
 
     def apart(self) -> list[str]:
         """Names of the parts that are saved separately."""
-        there = {"smoothed": self.smoothed is not None, "reports": bool(self.reports)}
-        return [name for name, is_there in there.items() if is_there]
+        there = {"reports": bool(self.reports), "transmissions": bool(self.transmissions)}
+        return super().apart() + [name for name, is_there in there.items() if is_there]
 
     def plot(
         self,
@@ -185,3 +249,7 @@ class Record(Saved):
                     counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
                     lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
         return lines
+
+
+def _per_node(nodes: Sequence[str], values: Mapping[str, int]) -> np.ndarray:
+    return np.array([values.get(node, -1) for node in nodes], dtype=np.int64)

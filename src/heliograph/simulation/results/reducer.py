@@ -14,7 +14,13 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import by_name, measurements_of, reports_by_name, uplinks_by_name
+from heliograph.simulation.results.by_name import (
+    by_name,
+    measurements_of,
+    reports_by_name,
+    transmissions_of,
+    uplinks_by_name,
+)
 from heliograph.simulation.results.record import Record
 
 Result = TypeVar("Result")
@@ -136,4 +142,6 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         for node, claims in network.claims().items()
     }
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
-    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports)
+    sent = transmissions_of(network, batch.get("transmissions", {}))
+    record = Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports)
+    return replace(record, transmissions=sent) if sent else record

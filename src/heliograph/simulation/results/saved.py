@@ -1,18 +1,19 @@
 """Datasets in files: NetCDF or Zarr, written whole or not at all, with names unchanged."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import copy
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from heliograph.disk.output_file import check_output
-from heliograph.disk.output_folder import check_replaceable, whole_folder
+from heliograph.disk.output_file import check_output, check_replaceable, whole_folder
 from heliograph.disk.quoting import from_file, in_file
 from heliograph.disk.whole_file import whole_file
 from heliograph.numerics.check import fail, file_path
+from heliograph.simulation.results.labelled import checked_units
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr
@@ -24,18 +25,41 @@ MARK = "zarr.json"  # what a Zarr folder has, and nothing else
 class Saved:
     """Results that convert to and from a dataset, and so to and from a file with `save` and `open`."""
 
+    states: tuple[str, ...]
+    units: dict[str, str]
+    smoothed: Self | None
+
+    def with_units(self, units: Mapping[str, str]) -> Self:
+        """Return the same results with units, by the state's name and of "time", for files, tables and figures.
+
+        Raises:
+            ValueError: a name that is no state.
+        """
+        smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
+        result = copy(self)
+        vars(result).update(units=checked_units(units, self.states), smoothed=smoothed)
+        return result
+
     def to_xarray(self) -> "xr.Dataset":
-        """Convert to labelled arrays."""
+        """Convert to labelled arrays.
+
+        Raises:
+            ModuleNotFoundError: without xarray (extra "results").
+        """
         raise NotImplementedError
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> Self:
-        """Convert back from labelled arrays."""
+        """Convert back from labelled arrays.
+
+        Raises:
+            ValueError: no such dataset.
+        """
         raise NotImplementedError
 
     def apart(self) -> list[str]:
         """Names of the parts that are not in the dataset, being results of their own."""
-        return []
+        return [] if self.smoothed is None else ["smoothed"]
 
     def save(self, path: str | Path) -> None:
         """Write to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` reads it.

@@ -1,20 +1,38 @@
 """Error statistics by node and filter."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+import numpy as np
+
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
-from heliograph.simulation.results.frames import statistics_frame
-from heliograph.simulation.results.labelled import checked_units
-from heliograph.simulation.results.labelled_statistics import statistics_dataset, statistics_from
+from heliograph.simulation.network import FUSED
+from heliograph.simulation.results.labelled import (
+    TIME,
+    check_title,
+    claims_of,
+    claims_text,
+    dataset_of,
+    filled,
+    names_of,
+    units_of,
+    uplink_variables,
+    uplinks_from,
+    values_of,
+)
 from heliograph.simulation.results.plots import plot_statistics
 from heliograph.simulation.results.saved import Saved
-from heliograph.simulation.results.statistics import ErrorStatistics
+from heliograph.simulation.results.statistics import ErrorStatistics, matrices
 
 if TYPE_CHECKING:  # extras
     import pandas as pd
     import xarray as xr
     from matplotlib.axes import Axes
+
+STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
 
 
 @readable
@@ -40,23 +58,55 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         self.states, self.units = states, dict(units or {})
         self.smoothed: StatisticsByName | None = None
 
-    def with_units(self, units: Mapping[str, str]) -> "StatisticsByName":
-        """Return the statistics with units, by the state's name, for files, tables and figures.
-
-        Raises:
-            ValueError: a name that is no state.
-        """
-        result = StatisticsByName(self, self.states, checked_units(units, self.states))
-        result.smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
-        return result
-
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
 
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
         """
-        return statistics_dataset(self)
+        # Statistics with their places.
+        nodes = list(self)
+        filters = list(dict.fromkeys(name for item in self.values() for name in item))
+        every = [
+            ((nodes.index(node), filters.index(name)), single)
+            for node, item in self.items()
+            for name, single in item.items()
+        ]
+        if not every:
+            raise fail("statistics", "those of one filter at least", "none")
+        sizes, n, first = (len(nodes), len(filters)), len(self.states), every[0][1]
+        batch, steps = (len(first.count), first.nees.shape[1]), first.nees.shape[1]
+
+        def of(name: str) -> np.ndarray:
+            """Return sums of pairs i <= j as symmetric matrices."""
+            return filled(batch, sizes, (n, n), [(place, matrices(getattr(item, name))) for place, item in every])
+
+        # Figures over time: squared errors, claimed variances, NEES, failures.
+        squares = [(place, np.diagonal(item.actual(), axis1=-2, axis2=-1)) for place, item in every]
+        claimed = [(place, np.diagonal(item.claimed(), axis1=-2, axis2=-1)) for place, item in every]
+        sums = [(place, item.nees) for place, item in every]
+        distances = [(place, item.nees.sum(axis=0) / item.runs / n) for place, item in every]
+        by_step = [(place, np.full(steps, np.nan) if item.failed is None else item.failed) for place, item in every]
+        failed = [(place, np.array(item.failed_runs)) for place, item in every]
+        filters_of = ["node", "filter"]
+        uplinks = {name: item.uplink for name, item in self.get(FUSED, {}).items() if item.uplink}
+        # Sums by batch, from which the statistics can be restored, then figures.
+        variables = {
+            "runs": (["batch"], first.count),
+            "errors": (["batch", TIME, *filters_of, "state", "other"], of("pairs")),
+            "claimed": (["batch", TIME, *filters_of, "state", "other"], of("claimed_pairs")),
+            "nees": (["batch", TIME, *filters_of], filled(batch, sizes, (), sums)),
+            "claim": (filters_of, claims_of(sizes, every)),
+            "failed": ([TIME, *filters_of], filled((steps,), sizes, (), by_step)),
+            "failed_runs": (filters_of, filled((), sizes, (), failed)),
+            "rmse": ([TIME, *filters_of, "state"], np.sqrt(filled((steps,), sizes, (n,), squares))),
+            "deviation": ([TIME, *filters_of, "state"], _root(filled((steps,), sizes, (n,), claimed))),
+            "nees_per_dimension": ([TIME, *filters_of], filled((steps,), sizes, (), distances)),
+            **uplink_variables(uplinks, [TIME], n),
+        }  # fmt: skip
+        labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states}
+        time = np.arange(1.0, steps + 1)
+        return dataset_of(STATISTICS, variables, labels, time, self.units, claims_text(self))
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
@@ -65,7 +115,34 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         Raises:
             ValueError: no such dataset.
         """
-        return statistics_from(dataset)
+        check_title(dataset, STATISTICS)
+        nodes, filters, states = (names_of(dataset, axis) for axis in ("node", "filter", "state"))
+        batch, of = ["batch", TIME, "node", "filter"], ["node", "filter"]
+        # Sums by batch; of symmetric matrices the pairs i <= j.
+        upper = np.triu_indices(len(states))
+        errors, claimed = (
+            values_of(dataset, name, [*batch, "state", "other"])[..., *upper] for name in ("errors", "claimed")
+        )
+        nees, claim, failed = (
+            values_of(dataset, name, axes) for name, axes in (("nees", batch), ("claim", of), ("failed", [TIME, *of]))
+        )
+        failed_runs, count = values_of(dataset, "failed_runs", of), values_of(dataset, "runs", ["batch"])
+        uplinks = uplinks_from(dataset, [TIME])
+        # Back to nodes and filters by name.
+        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in nodes}
+        for i, j in zip(*np.nonzero(claim != ""), strict=True):
+            by_step = None if np.isnan(failed[:, i, j]).any() else failed[:, i, j].copy()
+            results[nodes[i]][filters[j]] = ErrorStatistics(
+                count=count.copy(),
+                pairs=errors[:, :, i, j].copy(),
+                claimed_pairs=claimed[:, :, i, j].copy(),
+                nees=nees[:, :, i, j].copy(),
+                claim=cast(Claim, str(claim[i, j])),
+                uplink=uplinks.get(filters[j]) if nodes[i] == FUSED else None,
+                failed=by_step,
+                failed_runs=int(failed_runs[i, j]),
+            )
+        return cls(results, tuple(states), units_of(dataset))
 
     def to_pandas(self) -> "pd.DataFrame":
         """Table: a row for each node and filter, with claim, runs, RMSE, NEES, their errors, and figures by state.
@@ -73,11 +150,18 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
         """
-        return statistics_frame(self)
+        import pandas as pd
 
-    def apart(self) -> list[str]:
-        """Names of the parts that are saved separately."""
-        return [] if self.smoothed is None else ["smoothed"]
+        # Failed runs stand in the row, without a warning each.
+        rows, index = [], []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the row says in how many runs it failed
+            for node, filters in self.items():
+                for name, filter_ in filters.items():
+                    index.append((node, name))
+                    rows.append(_summary(filter_, self.states))
+        names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
+        return pd.DataFrame(rows, index=names)
 
     def plot(
         self,
@@ -115,3 +199,28 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
                             f"{node}/{name}: the quantizer of node {single} saturated in {share:.2%} of samples"
                         )
         return lines
+
+
+def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+    # Figures of all states together, then of each state.
+    nees, low, high = item.nees_per_dimension()
+    rmse, error = item.rmse()
+    # Figures of each state, after those of all together.
+    by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
+    total = {
+        "claim": "none" if item.failed_runs else item.claim,
+        "runs": item.runs,
+        "failed runs": item.failed_runs,
+        "rmse": rmse,
+        "rmse error": error,
+        "nees": nees,
+        "nees low": low,
+        "nees high": high,
+    }
+    for state, single, spread, claimed in by_state:
+        total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
+    return total
+
+
+def _root(variance: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))

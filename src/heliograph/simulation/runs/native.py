@@ -18,8 +18,7 @@ from heliograph.codegen.accumulated import Accumulated, Begun
 from heliograph.codegen.graph import Buffer, Type, Unsupported
 from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
 from heliograph.codegen.memory import LONG, InMemory
-from heliograph.codegen.program import Program
-from heliograph.codegen.summed import Summed
+from heliograph.codegen.program import Program, Summed
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 from heliograph.simulation.results.statistics import BATCHES
@@ -38,11 +37,7 @@ class Native(NamedTuple):
 
 
 def native(
-    world: World,
-    inputs: np.ndarray,
-    key: jax.Array,
-    reducer: AbstractReducer[Any],
-    later: Smoother | None = None,
+    world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], later: Smoother | None = None
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.codegen.compiled import threads
 from heliograph.codegen.engine import attempted
-from heliograph.codegen.summed import folded
+from heliograph.codegen.program import folded
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.medium import medium_of

@@ -1,1 +1,0 @@
-"""C99: a program as source text."""

@@ -1,0 +1,151 @@
+"""Rules of small matrices' decompositions: symmetric ones by Jacobi rotations until diagonal, others as L U."""
+
+from functools import cache
+from itertools import combinations
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+
+from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
+
+LARGEST = 8  # rows: of larger ones the straight line is long, and the library's method faster
+SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
+Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
+
+
+def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute eigenvectors (n, n), in columns, and eigenvalues (n,), ascending; all NaN if an entry is not finite.
+
+    Each rotation makes one off-diagonal entry zero; sweeps over all pairs end when the rest is below rounding.
+
+    Source: Jacobi, Ueber ein leichtes Verfahren (1846); Golub and Van Loan, Matrix computations, section 8.5.
+    """
+    n, eps = len(a), float(np.finfo(np.float64).eps)
+    entries = {(i, j): (a[i, j] + a[j, i]) / 2 for i in range(n) for j in range(i, n)}
+    finite = jnp.all(jnp.isfinite(a))
+    # Off-diagonal entries below eps ||A||_F / n are rounding.
+    size = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
+    vectors = {(i, j): jnp.asarray(float(i == j)) for i in range(n) for j in range(n)}
+
+    def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
+        rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
+        return jnp.any(jnp.stack(rest)) & (state[2] < SWEEPS)
+
+    # One sweep: A <- J' A J, V <- V J for each pair (p, q).
+    def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
+        entries, vectors = dict(state[0]), dict(state[1])
+        for p, q in combinations(range(n), 2):
+            _rotate(entries, vectors, p, q, n)
+        return entries, vectors, state[2] + 1
+
+    if n > 1:
+        entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
+    # Sort by odd-even transposition, which needs no branches.
+    values = [entries[i, i] for i in range(n)]
+    columns = [[vectors[i, j] for i in range(n)] for j in range(n)]
+    for turn in range(n):
+        for i in range(turn % 2, n - 1, 2):
+            _exchange(values, columns, i)
+    rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
+    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values), jnp.nan)
+
+
+def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
+    """Rotate rows and columns p and q so that a_pq = 0."""
+    off = a[p, q]
+    none = off == 0
+    half = (a[q, q] - a[p, p]) / jnp.where(none, 1.0, 2 * off)
+    tangent = jnp.where(half < 0, -1.0, 1.0) / (jnp.abs(half) + jnp.sqrt(half * half + 1))
+    t = jnp.where(none, 0.0, tangent)
+    c = 1 / jnp.sqrt(t * t + 1)
+    s = t * c
+    a[p, p], a[q, q], a[p, q] = a[p, p] - t * off, a[q, q] + t * off, jnp.zeros_like(off)
+    for k in range(n):
+        if k not in (p, q):
+            first, second = (min(k, p), max(k, p)), (min(k, q), max(k, q))
+            a[first], a[second] = c * a[first] - s * a[second], s * a[first] + c * a[second]
+        left, right = vectors[k, p], vectors[k, q]
+        vectors[k, p], vectors[k, q] = c * left - s * right, s * left + c * right
+
+
+def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
+    """Exchange places i and i + 1 unless they are in ascending order."""
+    wrong = values[i] > values[i + 1]
+    values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
+    low, high = columns[i], columns[i + 1]
+    columns[i] = [jnp.where(wrong, y, x) for x, y in zip(low, high, strict=True)]
+    columns[i + 1] = [jnp.where(wrong, x, y) for x, y in zip(low, high, strict=True)]
+
+
+def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    shape = avals[0].shape
+    if len(shape) != 2 or shape[0] > LARGEST or equation.params.get("subset_by_index") is not None:
+        raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
+    return lowering.inline(_program(shape[0]), inputs)
+
+
+@cache
+def _program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(eigh)(like((n, n), np.float64))
+
+
+IN_MEMORY |= {"eigh": _eigh}
+
+
+def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Compute L below the diagonal and U (n, n), the pivot row of each step (n,), and the order of rows (n,).
+
+    Each step takes the largest entry of the rest of its column, and needs one reciprocal.
+
+    Source: Golub and Van Loan, Matrix computations, section 3.4.
+    """
+    n = len(a)
+    rows, order, pivots = list(a), list(jnp.arange(n, dtype=jnp.int32)), []
+    for j in range(n):
+        # Partial pivoting: the largest |a_ij|, i >= j.
+        column = jnp.abs(jnp.stack([row[j] for row in rows[j:]]))
+        taken = j + jnp.argmax(column).astype(jnp.int32)
+        pivots.append(taken)
+        for i in range(j + 1, n):  # exchange rows j and i where i is taken
+            here = taken == i
+            rows[j], rows[i] = jnp.where(here, rows[i], rows[j]), jnp.where(here, rows[j], rows[i])
+            order[j], order[i] = jnp.where(here, order[i], order[j]), jnp.where(here, order[j], order[i])
+        # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j.
+        scale = 1 / rows[j][j]
+        for i in range(j + 1, n):
+            factor = rows[i][j] * scale
+            rest = rows[i][j + 1 :] - factor * rows[j][j + 1 :]
+            rows[i] = jnp.concatenate([rows[i][:j], factor[None], rest])
+    return jnp.stack(rows), jnp.stack(pivots), jnp.stack(order)
+
+
+def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    shape = avals[0].shape
+    if len(shape) != 2 or shape[0] != shape[1] or shape[0] > LARGEST:
+        raise Unsupported(f"factors of a matrix of shape {shape}")
+    return lowering.inline(_lu_program(shape[0]), inputs)
+
+
+@cache
+def _lu_program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(lu)(like((n, n), np.float64))
+
+
+def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Solve a system by the solver that it comes with."""
+    programs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
+    before = lengths.matvec + lengths.vecmat
+    fixed = inputs[before : before + lengths.solve]
+    right = inputs[before + lengths.solve + lengths.transpose_solve :]
+    return lowering.inline(programs.solve, [*fixed, *right])
+
+
+IN_MEMORY |= {"lu": _lu, "custom_linear_solve": _linear_solve}

@@ -1,0 +1,1 @@
+"""Filters of senders that decide when to send."""

@@ -1,0 +1,169 @@
+"""Factory of the filters behind a sender that decides when to send."""
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.modes.side_information import SideInformation, by_pattern
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.fading import uncertain_chain
+from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
+from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.random_affine.base import memories
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.modes import joint_modes
+
+
+def event_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    trigger: AbstractTrigger,
+    known: int = 3,
+    lost: int = 2,
+    transform: AbstractTransform | None = None,
+) -> AbstractFilter:
+    """Filter that knows when its sender sends, and so what it means that nothing came.
+
+    Silence says that y lies within delta of the sender's reference, or that what was sent was lost. The filter carries
+    a sum of Gaussians of (x, r), r the sender's reference: `known` of them where r is the value that came last, one for
+    each part of the interval in which y - r lay last, and at most `lost` where r is a value that was lost. With one of
+    each it costs a third, and claims up to 9 % too little variance in slow plants.
+
+    `channel` has the losses in it (`erasure`, `gilbert_elliott` of erasures): which of them the receiver knows of,
+    `trigger` says. A nonlinear plant or sensor goes through `transform`, `Cubature()` unless given (`Linearization()`
+    makes it an extended filter).
+
+    Claim: "exact" behind a `StochasticTrigger` without losses, or with losses that are known, and behind `Periodic`,
+    where plant and sensor are linear and no gain is random; else "nominal".
+
+    Raises:
+        ValueError: parts that do not fit, angles, a link whose memory drifts or whose delays are not 0, several
+            components that are each sent alone through links that are not lost one by one.
+    Source: the sum over the sender's reference; Sijs and Lazar, Event based state estimation with time synchronous
+        updates (2012), for what silence says; Han et al. (2015) for the stochastic trigger.
+    """
+    start = check_plant(plant)
+    instance("trigger", trigger, AbstractTrigger, "a trigger, such as SendOnDelta(0.5)")
+    check_link(first(sensor), first(channel), len(start.states))
+    refuse_angles("event filter", plant, sensor)
+    trigger.check_outputs(len(first(sensor).outputs))
+    known, lost = check_count("known", known), check_count("lost", lost, 0)
+    rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
+    described, initial = _described(channel)
+    steps = unstack(described) if isinstance(described, OverTime) else [described]
+    outputs = len(first(sensor).outputs)
+    loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
+    received = first(channel).outputs + trigger.side_information(outputs)
+    if isinstance(trigger, StochasticTrigger | Periodic):
+        sure = is_linear(plant, sensor) and all(_is_known(step) for step in steps) and not uncertain_chain(channel)
+        hidden = loses and trigger.losses == "unknown" and isinstance(trigger, StochasticTrigger)
+        return StochasticEventFilter(
+            plant=plant,
+            sensor=sensor,
+            channel=described,
+            trigger=trigger,
+            initial=initial,
+            transform=rule,
+            loses=loses,
+            claim="exact" if sure and not hidden else "nominal",
+            states=start.states,
+            inputs=start.inputs,
+            received=received,
+            outputs=outputs,
+        )
+    # A threshold: which losses and regions the sum holds.
+    threshold = instance(
+        "trigger", trigger, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these"
+    )
+    if not lost and loses and threshold.reference == "sent":
+        raise fail("lost", "at least 1, since transmissions may be lost", lost)
+    _check_region(threshold, outputs, first(channel).outputs, steps)
+    return EventFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        trigger=threshold,
+        initial=initial,
+        transform=rule,
+        known=known,
+        lost=lost,
+        loses=loses,
+        delivers=all(_delivers(step) for step in steps),
+        alike=all(_alike(step) for step in steps),
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=received,
+        outputs=outputs,
+    )
+
+
+def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
+    """The channel by mode and by what arrives, and the law of the modes at the first use."""
+    drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
+    if drifting:
+        raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
+    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    parts = by_pattern(steps, np.ones((len(steps[0].initial), 1)))
+    return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
+
+
+def _is_known(channel: SideInformation) -> bool:
+    """True if no gain is random, and what arrives is all that was sent."""
+    return _alike(channel) and not np.any(np.asarray(channel.spread)[..., :-1, :-1])
+
+
+def _alike(channel: SideInformation) -> bool:
+    """True if what arrives has the same law in all modes in which it can."""
+    possible = np.asarray(channel.chance) > 0
+    return all(
+        np.array_equal(part[rows, a], np.broadcast_to(part[rows, a][:1], part[rows, a].shape))
+        for part in (np.asarray(channel.mean), np.asarray(channel.spread))
+        for a, rows in enumerate(possible.T)
+        if channel.present[a].any() and rows.any()
+    )
+
+
+def _delivers(channel: SideInformation) -> bool:
+    """True if what arrives is y itself."""
+    m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
+    if m != p:
+        return False
+    parts = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].all()]
+    whole = np.all(channel.present, axis=1) | ~np.any(channel.present, axis=1)
+    plain = np.eye(m, p + 1)
+    return bool(whole.all()) and all(
+        np.array_equal(channel.mean[j, a], plain) and not np.any(channel.spread[j, a]) for j, a in parts
+    )
+
+
+def _check_region(trigger: AbstractThreshold, outputs: int, received: int, steps: list[SideInformation]) -> None:
+    """Refuse what the sum of Gaussians does not carry."""
+    if outputs == 1:
+        return
+    if trigger.region == "ball":
+        raise fail("region of the trigger", '"box" or "each", which the filter can cut to', "ball")
+    if trigger.region == "each":
+        if received != outputs:
+            raise fail("channel of components that are each sent alone", f"{outputs} outputs", received)
+        if not all(_one_by_one(step) for step in steps):
+            raise fail("channel of components that are each sent alone", "links side by side that lose them one by one "
+                       "and remember nothing, such as parallel([erasure(perfect(), .9)] * 2)", "another")  # fmt: skip
+
+
+def _one_by_one(channel: SideInformation) -> bool:
+    """True if components arrive as they are, and are lost independently of each other."""
+    m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
+    if len(chance) > 1:
+        return False
+    arrives = chance[0] @ np.asarray(channel.present)
+    product = np.prod(np.where(channel.present, arrives, 1 - arrives), axis=1)
+    plain = [np.array_equal(channel.mean[0, a][channel.present[a]], np.eye(m, m + 1)[channel.present[a]])
+             and not np.any(channel.spread[0, a]) for a in range(chance.shape[1]) if chance[0, a] > 0]  # fmt: skip
+    return all(plain) and np.allclose(product, chance[0], rtol=0, atol=1e-12)

@@ -1,0 +1,137 @@
+"""Weighted Gaussians of a sum: cut to where a component lies, joined, and reduced to few."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.truncated_normal import truncated_normal
+from heliograph.numerics.types import Array, Float
+
+FLOOR = 1e-6  # probability of what the rule forbids
+CERTAIN = 1e-24  # a variance below this share of its mean square and of the interval's is rounding
+
+
+class Parts(NamedTuple):
+    """Gaussians of a sum, with what is known of the sender in each.
+
+    log_weight (K,), mean (K, N), covariance (K, N, N), label (K, senders, ...): probabilities of each sender's
+    label given the Gaussian.
+    """
+
+    log_weight: Float[jax.Array, " K"]
+    mean: Float[jax.Array, "K N"]
+    covariance: Float[jax.Array, "K N N"]
+    label: Float[jax.Array, "K senders ..."]
+
+    def labelled(self, s: int, label: jax.Array) -> "Parts":
+        """Relabel sender s with (K, ...) whose sum is no longer 1: the sum goes into the weight."""
+        shape = (-1, *[1] * (label.ndim - 1))
+        total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
+        share = label / jnp.where(total > 0, total, 1.0).reshape(shape)
+        share = jnp.where((total > 0).reshape(shape), share, self.label[:, s])
+        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(share))
+
+    def times(self, log_factor: Array | float) -> "Parts":
+        """Multiply the weights by a factor."""
+        return self._replace(log_weight=self.log_weight + log_factor)
+
+    def keep(self, places: Array) -> "Parts":
+        """Some components of the Gaussians, in another order."""
+        return self._replace(mean=self.mean[:, places], covariance=self.covariance[:, places][:, :, places])
+
+
+def safe_log(x: jax.Array) -> jax.Array:
+    """log x, -inf at 0 without a derivative that is no number."""
+    return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
+
+
+def log_total(log_weight: jax.Array) -> jax.Array:
+    """log of the sum of weights; -inf where all are 0."""
+    top = jnp.max(log_weight)
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
+
+
+def together(parts: Sequence[Parts]) -> Parts:
+    """Several sums as one."""
+    return Parts(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+
+
+def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array | float) -> Parts:
+    """Each Gaussian cut to lower <= d'x <= upper, and the Gaussian of the same moments.
+
+    With c, S the mean and variance of d'x and k = P d / S:  w P(...), m + k sqrt(S) mu, P - k k' S (1 - v).
+    """
+    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
+    # Law of d'x; without variance it lies inside or it does not.
+    centre, column = parts.mean @ direction, parts.covariance @ direction
+    variance = column @ direction
+    size = centre**2 + jnp.where(jnp.isfinite(upper), upper, 0.0) ** 2 + jnp.where(jnp.isfinite(lower), lower, 0.0) ** 2
+    certain = variance <= CERTAIN * size
+    deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
+    moments = truncated_normal((lower - centre) / deviation, (upper - centre) / deviation)
+    inside = (lower <= centre) & (centre <= upper)
+    log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
+    gain = jnp.where(certain[:, None], 0.0, column / deviation[:, None])
+    # Moments of the part inside, where it has any probability.
+    possible = jnp.isfinite(log_mass)
+    shift = jnp.where(possible, moments.mean, 0.0)
+    less = jnp.where(possible, 1 - moments.variance, 0.0)
+    mean = parts.mean + gain * shift[:, None]
+    covariance = parts.covariance - less[:, None, None] * gain[:, :, None] * gain[:, None]
+    return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
+
+
+def join(parts: Parts) -> Parts:
+    """One Gaussian with the moments of the sum, (1, ...)."""
+    total = log_total(parts.log_weight)
+    share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+    share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
+    mean = share @ parts.mean
+    apart = parts.mean - mean
+    inside = parts.covariance + apart[:, :, None] * apart[:, None]
+    covariance = jnp.tensordot(share, inside, axes=1)
+    label = jnp.tensordot(share, parts.label, axes=1)
+    return Parts(total[None], mean[None], symmetrize(covariance)[None], label[None])
+
+
+def reduced(parts: Parts, count: int, places: slice) -> Parts:
+    """Reduce to at most `count` Gaussians: pairs that are nearest in the components `places` are joined first.
+
+    The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
+    """
+    while len(parts.log_weight) > count:
+        parts = _one_fewer(parts, places)
+    return parts
+
+
+def _one_fewer(parts: Parts, places: slice) -> Parts:
+    """The pair of least cost joined; it takes the place of its first, the last Gaussian that of its second."""
+    size = len(parts.log_weight)
+    pairs = list(combinations(range(size), 2))
+    first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
+    top = jnp.max(parts.log_weight)
+    weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
+    centre, spread = parts.mean[:, places], jnp.diagonal(parts.covariance, axis1=1, axis2=2)[:, places]
+    # Cost of each pair, and the least.
+    w1, w2 = weight[first], weight[second]
+    both = spread[first] + spread[second]
+    apart = (centre[first] - centre[second]) ** 2 / jnp.where(both > 0, both, 1.0)
+    cost = w1 * w2 / jnp.where(w1 + w2 > 0, w1 + w2, 1.0) * jnp.sum(apart, axis=1)
+    least = jnp.argmin(cost)
+    chosen = jnp.arange(len(pairs)) == least
+    is_first = jnp.stack([jnp.any(chosen & (first == i)) for i in range(size)])
+    is_second = jnp.stack([jnp.any(chosen & (second == i)) for i in range(size)])
+    # The two joined; the others keep their places.
+    merged = join(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
+
+    def placed(local: jax.Array, new: jax.Array) -> jax.Array:
+        shape = (-1, *[1] * (local.ndim - 1))
+        moved = jnp.where(is_second.reshape(shape), local[-1:], local)
+        return jnp.where(is_first.reshape(shape), new, moved)[:-1]
+
+    return Parts(*(placed(part, new) for part, new in zip(parts, merged, strict=True)))

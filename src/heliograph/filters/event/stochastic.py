@@ -1,0 +1,161 @@
+"""One Gaussian behind a sender whose silence is Gaussian: one that sends by chance, or by schedule."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
+from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.innovation import log_density
+from heliograph.filters.modes.mode_observations import receive
+from heliograph.filters.modes.side_information import SideInformation, with_flag
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.model.trigger import Periodic, StochasticTrigger
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+class StochasticBelief(NamedTuple):
+    """Mean (n,), covariance (n, n), the modes' law (M,) and the shared reference (m,) of the sender."""
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    law: Float[jax.Array, " M"]
+    reference: Float[jax.Array, " m"]
+    moved: jax.Array
+
+
+class StochasticEventFilter(AbstractSizedFilter):
+    """The filter of `event_filter` behind a `StochasticTrigger` or `Periodic`.
+
+    Silence of probability exp(-(y - r)' W (y - r) / 2) is r, measured of y with the noise W^-1: a Kalman update. Where
+    it may be a loss too it is the sum of the prior, of weight p, and of the updated Gaussian, of weight
+    (1 - p) (det W det S)^(-1/2) exp(-(C m - r)' S^-1 (C m - r) / 2), S = C P C' + R + W^-1; they are joined.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SideInformation | OverTime
+    trigger: StochasticTrigger | Periodic
+    initial: Float[Array, " M"]
+    transform: AbstractTransform
+    loses: bool = eqx.field(static=True)
+    outputs: int = eqx.field(static=True)
+
+    @property
+    def silence_tells(self) -> bool:
+        """Always true: silence is a measurement."""
+        return True
+
+    @in_float64
+    def init(self) -> StochasticBelief:
+        """The prior."""
+        start = at(self.plant, 0)
+        mean, covariance = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+        return StochasticBelief(
+            mean, covariance, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False)
+        )
+
+    @predicts
+    def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
+        """x and the modes move; both ends compute the next reference."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        moved = predicted(plant, self.transform, Belief(state.mean, state.covariance), u)
+        rows = jnp.asarray(at(self.channel, k).transition)
+        law = jnp.where(state.moved, state.law @ rows, state.law)
+        reference = state.reference
+        if self.trigger.reference == "prediction":
+            reference = self.reference(state.mean, u, k)
+        return StochasticBelief(moved.mean, moved.covariance, law, reference, jnp.asarray(True))
+
+    def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
+        """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
+        plant, sensor = at(self.plant, k), at(self.sensor, k)
+        x = plant.transition(mean, jnp.asarray(u)) + plant.noise_mean()
+        return jnp.asarray(sensor.measure(x) + sensor.noise.mean)
+
+    @corrects
+    def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
+        """A value that came, or that nothing did."""
+        plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        count = self.received - self.trigger.side_information(self.outputs)
+        values, down = z[:count], z[count:]
+        prior = Belief(state.mean, state.covariance)
+        signal = signal_of(plant, sensor, self.transform, prior)
+
+        # A value: each mode's update, joined.
+        modes = len(state.law)
+        start = at(self.plant, 0)
+        size = initial_size(start.initial_mean, start.initial_covariance)
+        belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
+        result, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
+        came = join(Parts(safe_log(weight), result.mean, result.covariance, jnp.eye(len(weight))[:, None]))
+
+        # Nothing: the link was down, and the prior stays; or the sender was silent.
+        lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
+        log_silent, quiet = self._silence(prior, signal, state.reference, k)
+        parts = [_alone(log_silent, quiet, state.law).labelled(0, state.law[None] * (1 - lost))]
+        if self.loses:
+            parts.append(_alone(jnp.zeros(()), prior, state.law).labelled(0, state.law[None] * lost))
+        if len(down):
+            up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
+            parts = [parts[0].times(up), *(part.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for part in parts[1:])]
+        nothing = join(together(parts))
+
+        there = jnp.any(~jnp.isnan(values))
+        log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
+        total = jnp.where(there, innovation.log_likelihood, log_nothing)
+        after = jax.tree.map(lambda a, b: jnp.where(there, a, b), came, nothing)
+        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        if len(down):
+            known, covariance = with_flag(covariance, down[0])
+            value = jnp.append(value, known)
+        following = state._replace(mean=after.mean[0], covariance=after.covariance[0], law=after.label[0, 0])
+        return following, Innovation(value, covariance, total)
+
+    def _silence(self, prior: Belief, signal: Signal, reference: jax.Array, k: Step) -> tuple[jax.Array, Belief]:
+        """log P(silent) where the link is up, and the state given it."""
+        if isinstance(self.trigger, Periodic):
+            due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
+            return jnp.where(due, -jnp.inf, 0.0), prior
+        weight = self.trigger.matrix(self.outputs)
+        total = signal.covariance + psd_solve(weight, jnp.eye(self.outputs))
+        value = reference - signal.mean
+        solved = psd_solve(total, signal.cross.T)
+        covariance = symmetrize(prior.covariance - signal.cross @ solved)
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(weight))))
+        density = log_density(value, total, jnp.abs(reference) + jnp.abs(signal.mean))
+        log_silent = density + (self.outputs * np.log(2 * np.pi) - log_det) / 2
+        return log_silent, Belief(prior.mean + value @ solved, covariance)
+
+    @in_float64
+    def estimate(self, state: StochasticBelief) -> Estimate:
+        """The Gaussian."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+    def smoother_step(
+        self, before: StochasticBelief, prior: StochasticBelief, after: StochasticBelief, innovation: Innovation,
+        z: ArrayLike, u: ArrayLike, k: Step,
+    ) -> AbstractSmootherStep:  # fmt: skip
+        """The moments around the update."""
+        local = Belief(before.mean, before.covariance)
+        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
+        return moments_smoother_step(after, prior, cross, self.claim)
+
+
+def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:
+    return Parts(log_weight[None], belief.mean[None], belief.covariance[None], law[None, None])

@@ -1,0 +1,220 @@
+"""A filter that learns the variances of its sensor's noise on line, by variational Bayes with forgetting."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
+from heliograph.filters.gaussian.scores import (
+    SMALLEST,
+    AbstractWeights,
+    Expected,
+    branch_precision,
+    joint_update,
+    reweighted,
+    score_update,
+    squared_residuals,
+)
+from heliograph.filters.innovation import log_density
+from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, over_time
+from heliograph.numerics.angle import nearest
+from heliograph.numerics.check import TINY, fail, scalar
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import diagonal, diagonal_of
+from heliograph.numerics.types import ArrayLike
+
+ITERATIONS = 5
+PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six noises of the filter's own variance say
+
+
+class AdaptiveBelief(NamedTuple):
+    """Mean (n,), covariance (n, n) of the state, and of each noise variance the inverse gamma law: R = b / a (m,)."""
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    shape: Float[jax.Array, " m"]
+    scale: Float[jax.Array, " m"]
+
+
+class AdaptiveFilter(AbstractSizedFilter):
+    """Gaussian or robust filter whose noise variances are learned. Built by `adaptive_filter`.
+
+    Of each component that arrived, with a_0, b_0 of the filter's own variance r = b_0 / a_0:
+
+        a' = rho a + (1 - rho) a_0,  b' = rho b + (1 - rho) b_0,  a = a' + 1/2,
+        R = b / a and b = b' + w E / 2,  E = (z - t+)^2 + V+, five times, from the same prior,
+
+    w its weight (1 in a plain filter). A component that did not arrive leaves its law as it is.
+
+    Args:
+        base: the filter whose noise variances are learned.
+        noise: its noise as it arrives, whose variance is the prior b_0 / a_0.
+        memory: rho.
+        claim: always "nominal".
+        states: names of the states.
+        inputs: names of the inputs.
+        received: number of received components m.
+    """
+
+    base: GaussianFilter | RobustFilter
+    noise: ReceivedNoise | OverTime
+    memory: Float[jax.Array | np.ndarray, ""]
+
+    @in_float64
+    def init(self) -> AdaptiveBelief:
+        """The filter's prior, and the variances' with as much weight as forgetting leaves them."""
+        shape = jnp.full(self.received, PRIOR_SHAPE)
+        return AdaptiveBelief(*self.base.init(), shape, shape * diagonal_of(jnp.asarray(at(self.noise, 0).covariance)))
+
+    @predicts
+    def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
+        """The state as the filter does; what is known of the variances stays until something arrives."""
+        return AdaptiveBelief(*self.base.predict(Belief(state.mean, state.covariance), u, k), state.shape, state.scale)
+
+    @corrects
+    def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
+        """Use what arrived of z for the state and for the variances."""
+        # Moments of what arrives without its noise, and the noise's law.
+        item, belief, noise = self.base, Belief(state.mean, state.covariance), at(self.noise, k)
+        sensor, plant = at(item.sensor, k), at(item.plant, k)
+        signal = signal_without_noise(plant.angles, sensor, item.transform, belief)
+        before = expected_of(belief, signal, at(item.channel, k))
+        angles = item.received_angles if isinstance(item, RobustFilter) else item.observed_angles
+        z = nearest(jnp.asarray(z), before.signal, angles)
+        rule = item.rule if isinstance(item, RobustFilter) else None
+        law = noise.law(signal.mean) if isinstance(item, RobustFilter) and rule is None else None
+        learned = _learn(
+            before,
+            state,
+            z,
+            noise.center,
+            diagonal_of(jnp.asarray(noise.covariance)),
+            jnp.asarray(self.memory),
+            rule,
+            law,
+        )
+        # The innovation that a Gaussian filter with the learned variances reports.
+        value, covariance, present = z - before.signal - noise.center, learned.covariance, ~jnp.isnan(z)
+        both = present[:, None] & present[None]
+        density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
+        innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
+        return learned.after, innovation
+
+    @in_float64
+    def estimate(self, state: AdaptiveBelief) -> Estimate:
+        """The filter's own."""
+        estimate_ = self.base.estimate(Belief(state.mean, state.covariance))
+        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+
+    def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
+        """Noise variances of what arrives, b / a, of one state or of several stacked."""
+        result: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
+        return result
+
+
+class Learned(NamedTuple):
+    """State after the update, innovation covariance (m, m) with the learned variances, weight of each component."""
+
+    after: AdaptiveBelief
+    covariance: jax.Array
+    weight: jax.Array
+
+
+@runs_last
+def _learn(
+    before: Expected,
+    state: AdaptiveBelief,
+    z: jax.Array,
+    center: jax.Array,
+    variance: jax.Array,
+    memory: jax.Array,
+    rule: AbstractWeights | None,
+    law: Law | None,
+) -> Learned:
+    arrived = ~jnp.isnan(z)
+    center, variance = (x.reshape(x.shape + (1,) * (z.ndim - x.ndim)) for x in (center, variance))
+    # Forget towards the prior, and count the new value.
+    first = PRIOR_SHAPE * (1 - memory)
+    shape, scale = memory * state.shape + first, memory * state.scale + first * variance
+    after_shape = shape + 0.5
+    e = jnp.where(arrived, z - before.signal - center, 0.0)
+    noise, weight, shown, received = scale / shape, jnp.ones_like(e), jnp.ones_like(e), arrived
+    residual = e
+    # Variational Bayes: an update with R = b / a, then b from what is known of the noise's square.
+    for _ in range(ITERATIONS):
+        if law is not None:  # each branch's noise in units of the variance
+            weight, shift = branch_precision(before, e + center, variance, _scaled(law, noise / variance))
+            residual = jnp.where(arrived, e + center - shift, 0.0)
+            shown = weight
+        elif rule is not None:
+            weight, shown = rule.iterate(before, diagonal(noise), e, arrived)
+            received = arrived & (weight > SMALLEST)
+        used = reweighted(diagonal(noise), weight)
+        learned = scale + weight * squared_residuals(before, used, residual, received) / 2
+        last, noise = noise, jnp.where(received, learned / after_shape, noise)
+    # The state with the last variances.
+    if law is not None:
+        branches = _scaled(law, last / variance)
+        result = score_update(before, z, *branches)
+        x, p = result.mean, result.covariance
+    else:
+        x, p = joint_update(before, e, received, used)
+    after = AdaptiveBelief(
+        x, p, jnp.where(received, after_shape, state.shape), jnp.where(received, noise * after_shape, state.scale)
+    )
+    return Learned(after, before.spread + diagonal(last), jnp.where(arrived, shown, jnp.nan))
+
+
+def _scaled(law: Law, ratio: jax.Array) -> Law:
+    """The law with noise of other units: a variance `ratio` times as large."""
+    ratio = ratio[:, None]
+    return Law(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)
+
+
+def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
+    """Filter with the noise variances of its sensor learned on line, each forgetting with `memory` a step.
+
+    Forgetting goes towards the filter's own variance, which also remains after
+    losses, and never towards none. The process noise is taken as true: a Q that is too small is absorbed by R (learn Q
+    first, with `fit`).
+
+    Claim: "nominal".
+
+    Args:
+        filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
+        memory: share of what was learned that a step leaves, over 0 and at most 1 (never forget); a variance is known
+            from some 1 / (1 - memory) values.
+
+    Raises:
+        ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].
+    Source: Sarkka and Nummenmaa, Recursive noise adaptive Kalman filtering by variational Bayesian approximations
+        (2009), with a forgetting that keeps a prior.
+    """
+    if not isinstance(filter, GaussianFilter | RobustFilter):
+        expected = "one of kalman_filter, extended_filter, cubature_filter or robust_filter"
+        raise fail("filter to adapt", expected, type(filter).__name__)
+    stored = scalar("memory of an adaptive filter", memory, TINY, 1.0)
+    noise = filter.noise if isinstance(filter, RobustFilter) else _noise_of(filter)
+    return AdaptiveFilter(
+        base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
+        received=filter.received,
+    )  # fmt: skip
+
+
+def _noise_of(item: GaussianFilter) -> ReceivedNoise | OverTime:
+    """The sensor's noise as it arrives."""
+    steps = [part.steps for part in (item.sensor, item.channel) if isinstance(part, OverTime)]
+    if not steps:
+        return received_noise(at(item.sensor, 0).noise, None, at(item.channel, 0), True)
+    return over_time(
+        [received_noise(at(item.sensor, k).noise, None, at(item.channel, k), True) for k in range(max(steps))]
+    )

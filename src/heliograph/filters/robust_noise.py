@@ -1,0 +1,246 @@
+"""The noise that may hold outliers as it arrives behind a channel, and the channel without it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heliograph.filters.gaussian.update import Polytope
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import add, times_vector
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.outliers import (
+    Branches,
+    StudentT,
+    branches,
+    has_outliers,
+    nominal,
+)
+
+Vector = Float[jax.Array | np.ndarray, " m"]
+Matrix = Float[jax.Array | np.ndarray, "m branches"]
+TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for rounding
+
+
+class Law(NamedTuple):
+    """Gaussian branches of each received component's noise, about the noise's mean: (m, branches) each.
+
+    least: the branch's own noise, below which the variance of an innovation is not.
+    """
+
+    log_share: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+    least: jax.Array
+
+    def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
+        """Mean and variance of the mixture, (m,) each."""
+        return _two_moments(*self[:3])
+
+
+@runs_last
+def _two_moments(log_share: jax.Array, mean: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    share = jnp.exp(log_share)
+    center = add([(share * mean)[:, j] for j in range(mean.shape[1])])
+    second = share * (variance + (mean - center[:, None]) ** 2)
+    return center, add([second[:, j] for j in range(mean.shape[1])])
+
+
+class ReceivedNoise(Module):
+    """Noise of each received component that may hold outliers: of one output of the sensor, and of the last hop.
+
+    `share`, `mean`, `variance`: branches of the output's noise, before the gain; `late_mean`, `late_variance` what the
+    last hop adds to each (m, branches). `output` (m, p) picks the output, `gain` is E[g] and `power` E[g^2] (m,).
+    `center` and `covariance` (m, m): the same noise without outliers, as it arrives. `degrees` (m,): Student's.
+    """
+
+    log_share: Matrix
+    mean: Matrix
+    variance: Matrix
+    late_mean: Matrix
+    late_variance: Matrix
+    output: Float[jax.Array | np.ndarray, "m p"]
+    gain: Vector
+    power: Vector
+    center: Vector
+    covariance: Float[jax.Array | np.ndarray, "m m"]
+    degrees: Vector
+
+    def law(self, sensed: jax.Array) -> Law:
+        """Branches as they arrive, for a sensor's signal of this mean (p,).
+
+        Branch j of a noise before the gain arrives with mean E[g] m_j and variance
+        E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
+        mean together. With that of the signal alone, Var(g) y^2, it is at least E[g^2] r_j.
+        """
+        return _law(self, sensed)
+
+
+@runs_last
+def _law(noise: ReceivedNoise, sensed: jax.Array) -> Law:
+    gain, power, mean = noise.gain[:, None], noise.power[:, None], noise.mean
+    signal = times_vector(noise.output, sensed)[:, None]
+    least = power * noise.variance + noise.late_variance
+    variance = least + (power - gain**2) * mean * (mean + 2 * signal)
+    parts = noise.log_share, gain * mean + noise.late_mean, variance, least
+    return Law(*(jnp.broadcast_to(x, variance.shape) for x in parts))
+
+
+class SplitChannel(NamedTuple):
+    """A channel without the noise of its last hop that has outliers, and that noise (None: there is none)."""
+
+    plain: AbstractRandomAffine
+    noise: AbstractNoise | None
+
+
+def split(channel: AbstractRandomAffine) -> SplitChannel:
+    """Take the last hop's noise from a channel where its law has outliers; its mean stays."""
+    match channel:
+        case GainAndNoise() if has_outliers(channel.noise):
+            still = Gaussian(np.zeros((channel.outputs, channel.outputs)), channel.noise.mean)
+            return SplitChannel(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
+        case Series():
+            *before, last = channel.maps
+            part = split(last)
+            return (
+                SplitChannel(Series([*before, part.plain]), part.noise) if part.noise else SplitChannel(channel, None)
+            )
+        case Stack():
+            # Parallel links are split one by one; one without outliers has no noise to take.
+            parts = [split(part) for part in channel.maps]
+            if not any(part.noise for part in parts):
+                return SplitChannel(channel, None)
+            noises = [part.noise or Gaussian(np.zeros((part.plain.outputs,) * 2)) for part in parts]
+            return SplitChannel(Stack([part.plain for part in parts]), Independent(noises))
+    return SplitChannel(channel, None)
+
+
+def received(
+    sensor: AnySensor, channel: Channel, apart: bool
+) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
+    """The channel's moments without the noise that may hold outliers, and that noise as it arrives.
+
+    `apart`: components are taken one after another, and must be independent.
+
+    Raises:
+        ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
+    """
+    steps = max((item.steps for item in (sensor, channel) if isinstance(item, OverTime)), default=None)
+    if steps is None:
+        parts = split(first(channel))
+        plain = Polytope().describe(parts.plain)
+        return plain, received_noise(first(sensor).noise, parts.noise, plain, apart)
+    channels = unstack(channel) if isinstance(channel, OverTime) else [channel] * steps
+    pieces = [split(item) for item in channels]
+    plains = [Polytope().describe(piece.plain) for piece in pieces]
+    noises = [
+        received_noise(at(sensor, k).noise, piece.noise, plain, apart)
+        for k, (piece, plain) in enumerate(zip(pieces, plains, strict=True))
+    ]
+    return over_time(plains) if isinstance(channel, OverTime) else plains[0], over_time(noises)
+
+
+def received_noise(sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, apart: bool) -> ReceivedNoise:
+    """The noise as it arrives: of the sensor, and `late` of the last hop, behind a channel described without it.
+
+    Raises:
+        ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
+    """
+    m, p = plain.mean_gain.shape
+    rows, xp = np.arange(m), library(plain.power.center, sensed, late)
+    squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
+    # Moments of the noise without its outliers, as it arrives.
+    base, last = nominal(sensed), nominal(late) if late is not None else None
+    source = _sources(squares, base.covariance, plain)
+    covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
+    center = plain.mean_gain @ base.mean
+    if last is not None:
+        covariance, center = covariance + last.covariance, center + last.mean
+    _check(covariance, apart)
+    # Branches of the sensor's noise, and their pairs with those of the last hop's.
+    log_share, mean, variance = (part[source] for part in branches(sensed))
+    late_mean: Array = np.zeros(mean.shape)
+    late_variance: Array = late_mean
+    if late is not None:
+        log_share, mean, variance, late_mean, late_variance = _pairs(
+            Branches(log_share, mean, variance), branches(late)
+        )
+    return ReceivedNoise(
+        log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,
+        output=np.eye(p)[source], gain=plain.mean_gain[rows, source], power=squares[rows, source],
+        center=center, covariance=covariance, degrees=_degrees(sensed, late)[source],
+    )  # fmt: skip
+
+
+def _sources(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
+    """Output whose noise each received component brings, (m,).
+
+    Raises:
+        ValueError: one that brings the noise of several.
+    """
+    m, p = squares.shape
+    if is_traced(squares, covariance):
+        if m != p:
+            raise fail("channel with free numbers before a robust filter", f"{p} outputs", m)
+        return np.arange(m)
+    brought = np.asarray(squares) * np.diag(np.asarray(covariance))
+    largest = np.max(brought, axis=1, keepdims=True, initial=0.0)
+    several = np.count_nonzero(brought > TOLERANCE**2 * largest, axis=1)
+    if np.any(several > 1):
+        expected = "one that brings each received number the noise of one output of the sensor"
+        raise fail("channel of a robust filter", expected, f"{several.max()} outputs in number {int(several.argmax())}")
+    return np.asarray(np.argmax(brought, axis=1))
+
+
+def _check(covariance: Array, apart: bool) -> None:
+    """Raise ValueError where no noise could be weighed, or where components are correlated and may not be."""
+    if is_traced(covariance):
+        return
+    variance = np.diag(covariance)
+    if np.any(variance <= 0):
+        expected = "noise of the sensor (or a law with outliers in the last hop) in each received number"
+        raise fail("noise of a robust filter", expected, f"variance {variance.min():g}")
+    off = np.abs(covariance - np.diag(variance)) / np.sqrt(np.outer(variance, variance))
+    if apart and np.any(off > TOLERANCE):
+        expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
+        raise fail("noise of a robust filter", expected, f"a correlation of {off.max():.3g}")
+
+
+def _pairs(sensed: Branches, late: Branches) -> tuple[Array, ...]:
+    """All pairs of branches: log shares add up, means and variances stay apart."""
+    xp = library(sensed, late)
+    shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
+
+    def every(value: Array, first: bool) -> Array:
+        wide = value[:, :, None] if first else value[:, None]
+        result: Array = xp.broadcast_to(wide, shape).reshape(shape[0], -1)
+        return result
+
+    shares = every(sensed.log_share, True) + every(late.log_share, False)
+    return (shares, every(sensed.mean, True), every(sensed.variance, True), every(late.mean, False),
+            every(late.variance, False))  # fmt: skip
+
+
+def _degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
+    """Student's degrees of each output; NaN where the noise has another law."""
+    parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
+    values = [
+        part.degrees * np.ones(part.dimension) if isinstance(part, StudentT) and late is None
+        else np.full(part.dimension, np.nan)
+        for part in parts
+    ]  # fmt: skip
+    result: Vector = library(values).concatenate(values)
+    return result

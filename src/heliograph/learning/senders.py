@@ -1,0 +1,172 @@
+"""Numbers of a sender that decides when to send, learned from what came and from what did not."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.factory import event_filter
+from heliograph.learning.description import Description
+from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.solution import TWO_SIDED, Row
+from heliograph.numerics.check import fail
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.likelihood import log_likelihood
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+FURTHEST = 4.0  # on the line, in logarithms and logits: an interval that reaches so far has no end there
+HALVINGS = 12
+DIGITS = 1e-4  # of the line
+
+Likelihood = Callable[[Float[np.ndarray, " p"]], float]
+
+
+@readable
+@dataclass(frozen=True)
+class SenderFit:
+    """Result of a fit behind a sender that decides: as `Fit`, with intervals by the profile of the likelihood.
+
+    Args:
+        description: the network with free numbers.
+        x: the maximum on the line, (p,).
+        total: log-likelihood of the maximum, in nats.
+        table: a row for each number.
+        converged: True if the search for the maximum converged.
+    """
+
+    description: Description
+    x: Float[np.ndarray, " p"]
+    total: float
+    table: tuple[Row, ...]
+    converged: bool
+
+    @property
+    def network(self) -> Network:
+        """The network with the estimates in their places."""
+        return self.description.at_point(self.x)
+
+    @property
+    def values(self) -> dict[str, float | np.ndarray]:
+        """The estimates by name."""
+        return self.description.parameters.known(self.x)
+
+    @property
+    def log_likelihood(self) -> dict[str, float]:
+        """Log-likelihood at the maximum, in nats, by its form."""
+        return {"conditional": self.total}
+
+    def rows(self) -> tuple[Row, ...]:
+        """The table."""
+        return self.table
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Remarks on the fit; none where the search converged."""
+        return () if self.converged else ("The search did not converge: the estimates are the best points found.",)
+
+    def __str__(self) -> str:
+        """The table and the sentences."""
+        width = max(len(row.name) for row in self.table)
+        lines = [f"{row.name:{width}}  {row.estimate:10.4g}  ({row.low:.4g} .. {row.high:.4g})" for row in self.table]
+        return "\n".join([*lines, *self.sentences])
+
+
+def decides(network: Network) -> bool:
+    """Return True if a sender of the network decides when to send."""
+    return any(isinstance(node, Node) and node.trigger is not None for node in network.nodes.values())
+
+
+def fit_sender(
+    description: Description,
+    recording: object,
+    inputs: ArrayLike | Sequence[ArrayLike] | None,
+    starts: int,
+    seed: int,
+) -> SenderFit:
+    """The maximum of the likelihood of `event_filter`, with its silences, and its profile for each number.
+
+    In delta the likelihood has steps, where a value that came would have been silent: so it is searched without
+    derivatives (Nelder and Mead), from the start and from others around it. The interval of a number is where twice
+    the likelihood, largest over all others, is within 3.84 of its maximum.
+
+    Raises:
+        ValueError: more than one node; numbers with no coordinate of their own; recordings that do not fit.
+    """
+    parameters = description.parameters
+    if len(description.start.names) != 1:
+        raise fail("network whose sender decides", "one node, to be learned", list(description.start.names))
+    if any(entry.place is None for entry in parameters.entries):
+        raise fail(
+            "free numbers of a sender that decides", "numbers with limits of their own", "a simplex or covariance"
+        )
+    # The likelihood of all recordings at a point of the line.
+    data = gathered(description.start, recording, inputs, parameters.size)
+
+    def likelihood(x: Float[np.ndarray, " p"]) -> float:
+        item = filter_at(description.at_point(x))
+        rows = zip(data.measurements, data.inputs, data.lengths, strict=True)
+        total = sum(float(log_likelihood(item, z[:n], u[:n])) for z, u, n in rows)
+        return total if np.isfinite(total) else -1e300
+
+    # The best of several starts, and the profile of each number.
+    random = np.random.default_rng(seed)
+    points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
+    ends = [_highest(likelihood, np.asarray(point)) for point in points]
+    x, total, converged = max(ends, key=lambda end: end[1])
+    table = tuple(_row(description, likelihood, x, total, i) for i in range(len(parameters.entries)))
+    return SenderFit(description, x, total, table, converged)
+
+
+def filter_at(network: Network) -> AbstractFilter:
+    """The filter whose likelihood counts."""
+    (node,) = network.nodes.values()
+    if not isinstance(node, Node) or node.trigger is None:
+        raise fail("node to be learned", "one whose sender decides", type(node).__name__)
+    return event_filter(network.plant, node.sensor, node.channel, node.trigger)
+
+
+def _highest(likelihood: Likelihood, start: Float[np.ndarray, " p"]) -> tuple[Float[np.ndarray, " p"], float, bool]:
+    """The maximum that is reached from a start."""
+    if not len(start):
+        return start, likelihood(start), True
+    simplex = start + 0.2 * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
+    options: Any = {"initial_simplex": simplex, "xatol": DIGITS, "fatol": 1e-3, "maxfev": 200 * len(start)}
+    climb: Any = minimize  # its types do not know an initial simplex
+    result = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options)
+    return np.asarray(result.x), -float(result.fun), bool(result.success)
+
+
+def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int) -> Row:
+    """The estimate, and how far the profile stays near its maximum to either side."""
+    entry = description.parameters.entries[index]
+    place = index if entry.place is None else entry.place
+
+    def profile(value: float) -> float:
+        rest = np.delete(x, place)
+        return _highest(lambda other: likelihood(np.insert(other, place, value)), rest)[1]
+
+    def number(value: float) -> float:
+        point = x.copy()
+        point[place] = value
+        return float(description.parameters.entries_at(point)[index])
+
+    # Doubled steps until the profile is below, then bisection.
+    ends = []
+    for sign in (-1.0, 1.0):
+        inside, outside = 0.0, 0.05
+        while outside < FURTHEST and profile(x[place] + sign * outside) > total - TWO_SIDED:
+            inside, outside = outside, 2 * outside
+        for _ in range(HALVINGS):
+            middle = (inside + outside) / 2
+            near = profile(x[place] + sign * middle) > total - TWO_SIDED
+            inside, outside = (middle, outside) if near else (inside, middle)
+            if outside - inside < 1e-3:
+                break
+        ends.append(number(x[place] + sign * outside))
+    low, high = sorted(ends)
+    return Row(entry.name, number(x[place]), low, high, (high - low) / (2 * 1.96), "conditional", False, True)

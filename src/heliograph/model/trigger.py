@@ -1,0 +1,311 @@
+"""Triggers: rules by which a sender transmits: by schedule, on change, on a prediction's error, or by chance."""
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar, shown
+from heliograph.numerics.domain import POSITIVE, tell
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+Reference = Literal["sent", "acknowledged", "prediction", "zero"]
+Region = Literal["box", "ball", "each"]
+Losses = Literal["unknown", "numbered", "known"]
+
+
+@readable
+class SendReason:
+    """Why a sender transmits; negative in a record where the transmission was lost, 0 where it sent nothing."""
+
+    SILENT, EVENT, HEARTBEAT, FIRST, SCHEDULE = range(5)
+
+
+class Sender(NamedTuple):
+    """State of a sender after a step, for each component of y.
+
+    Shapes (m,) all: reference, what y is compared with; age, steps since the last transmission; begun, whether there is
+    a reference; lost, transmissions lost since the last that arrived; last, the reason of this step.
+    """
+
+    reference: jax.Array
+    age: jax.Array
+    begun: jax.Array
+    lost: jax.Array
+    last: jax.Array
+
+
+@readable
+class AbstractTrigger(Module):
+    """A sender's rule: at each step it transmits the measurement y, or nothing.
+
+    Args:
+        region: "box" and "ball" transmit all of y or nothing, "each" decides for each component alone.
+        losses: knowledge of the receiver of a transmission that was lost: "unknown", none; "numbered", from the
+            sequence number of the next value that arrives; "known", at once. It arrives behind z: the number of
+            transmissions lost since the last value (with a value), or whether one was lost now (0 or 1).
+        reference: what y is compared with: the value "sent" or "acknowledged" last, a "prediction" of both
+            ends, or "zero".
+        heartbeat: most steps between two transmissions; None where there is no such limit.
+    """
+
+    region: eqx.AbstractVar[Region]
+    losses: eqx.AbstractVar[Losses]
+    reference: eqx.AbstractVar[Reference]
+    heartbeat: eqx.AbstractVar[int | None]
+
+    @property
+    def needs_reference(self) -> bool:
+        """True if the first value has to be sent, since there is nothing yet to compare with."""
+        return self.reference in ("sent", "acknowledged")
+
+    def side_information(self, outputs: int) -> int:
+        """Count the numbers about losses that arrive behind z."""
+        if self.losses == "unknown":
+            return 0
+        return outputs if self.region == "each" else 1
+
+    def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+        """Decide for each component whether error = y - reference, (m,), makes it be sent at step k."""
+        raise NotImplementedError
+
+    def check_outputs(self, outputs: int) -> None:
+        """Raise ValueError unless the rule's numbers fit so many components."""
+
+    def start(self, outputs: int) -> Sender:
+        """A sender that has transmitted nothing yet."""
+        nothing = jnp.zeros(outputs, dtype=int)
+        begun = jnp.full(outputs, not self.needs_reference)
+        return Sender(jnp.zeros(outputs), nothing, begun, nothing, nothing)
+
+    def reasons(self, sender: Sender, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+        """Return the reason for which each component is sent, (m,); 0 where it is not."""
+        reason = jnp.where(self.event(y - sender.reference, key, k), self._own_reason(), SendReason.SILENT)
+        if self.heartbeat is not None:
+            due = sender.age + 1 >= self.heartbeat
+            reason = jnp.where(due & (reason == SendReason.SILENT), SendReason.HEARTBEAT, reason)
+        return jnp.where(sender.begun, reason, SendReason.FIRST)
+
+    def _own_reason(self) -> int:
+        return SendReason.EVENT
+
+    def after(self, sender: Sender, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> Sender:
+        """The sender after it transmitted what has a reason, of which `arrived` arrived."""
+        sent = reason > 0
+        arrived = arrived & sent
+        renewed = arrived if self.reference == "acknowledged" else sent
+        reference = jnp.where(renewed, y, sender.reference) if self.needs_reference else sender.reference
+        lost = jnp.where(arrived, 0, sender.lost + (sent & ~arrived))
+        last = jnp.where(sent & ~arrived, -reason, reason)
+        return Sender(reference, jnp.where(sent, 0, sender.age + 1), sender.begun | renewed, lost, last)
+
+    def transmit(
+        self, sender: Sender, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[Sender, jax.Array]:
+        """The sender that follows, and what the receiver gets where the channel would make z of y."""
+        reason, there = self.reasons(sender, y, key, k), ~jnp.isnan(z)
+        items = self.region == "each"
+        arrived = there if items else jnp.full(len(y), jnp.any(there))
+        sent = reason > 0 if items else jnp.any(reason > 0)
+        received = jnp.concatenate([jnp.where(sent, z, jnp.nan), self.known_losses(sender, reason, arrived)])
+        return self.after(sender, y, reason, arrived), received
+
+    def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
+        """Numbers about losses that arrive behind z, from the sender before this step."""
+        sent = reason > 0
+        if self.losses == "numbered":
+            result = jnp.where(arrived & sent, sender.lost.astype(float), jnp.nan)
+        else:
+            result = (sent & ~arrived).astype(float)
+        return result[: self.side_information(len(result))]
+
+
+class AbstractThreshold(AbstractTrigger):
+    """A rule that transmits where y - reference leaves a region of size delta."""
+
+    delta: eqx.AbstractVar[Float[Array, "..."]]
+
+    def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+        """|y - reference| > delta, of a component, of any of them, or of all as a vector."""
+        delta = jnp.asarray(self.delta)
+        if self.region == "ball":
+            return jnp.full(len(error), jnp.sum(error**2) > delta**2)
+        beyond = jnp.abs(error) > delta
+        return beyond if self.region == "each" else jnp.full(len(error), jnp.any(beyond))
+
+    def check_outputs(self, outputs: int) -> None:
+        """Raise ValueError unless delta is one number, or one for each component of a box."""
+        if np.ndim(self.delta) and (self.region == "ball" or np.shape(self.delta) != (outputs,)):
+            expected = "one number" if self.region == "ball" else f"one number, or {outputs}"
+            raise fail("delta of the trigger", expected, f"shape {np.shape(self.delta)}")
+
+
+class SendOnDelta(AbstractThreshold):
+    """Transmit y where it left the interval reference +- delta, and at the latest `heartbeat` steps after the last.
+
+    The reference is the value transmitted last, whether or not it arrived ("sent"), or the one acknowledged last
+    ("acknowledged"). The first value is always sent. region: with several components "box" transmits y where one of
+    them left its interval, "ball" where |y - reference| > delta, "each" only the components that left theirs.
+    losses: what the receiver knows of them, as `AbstractTrigger` says.
+
+    Shapes: delta (), or (m,) of a box and of each.
+
+    Raises:
+        ValueError: a delta that is not positive, a heartbeat below 1, an unknown reference, region or kind of losses.
+    Source: Miskowicz, Send-on-delta concept: an event-based data reporting strategy (2006).
+    """
+
+    delta: Float[Array, "..."]
+    heartbeat: int | None = eqx.field(static=True)
+    reference: Reference = eqx.field(static=True)
+    region: Region = eqx.field(static=True)
+    losses: Losses = eqx.field(static=True)
+
+    def __init__(
+        self,
+        delta: ArrayLike,
+        heartbeat: int | None = None,
+        reference: Literal["sent", "acknowledged"] = "sent",
+        region: Region = "box",
+        losses: Losses = "unknown",
+    ):
+        self.delta, self.region = threshold(delta), one_of("region", region, Region)
+        self.heartbeat = None if heartbeat is None else check_count("heartbeat", heartbeat)
+        self.reference = one_of("reference", reference, Literal["sent", "acknowledged"])
+        self.losses = one_of("losses", losses, Losses)
+
+
+class SendOnPredictionError(AbstractThreshold):
+    """Transmit y where it left the interval prediction +- delta; both ends compute the prediction.
+
+    It is h(f(xhat)) of the filter at the node that is made with this trigger, so the sender has to know what arrived.
+    region, losses and heartbeat as of `SendOnDelta`.
+
+    Shapes: delta (), or (m,) of a box and of each.
+
+    Raises:
+        ValueError: as `SendOnDelta`.
+    Source: Wu, Jia, Johansson and Shi, Event-based sensor data scheduling (2013).
+    """
+
+    delta: Float[Array, "..."]
+    heartbeat: int | None = eqx.field(static=True)
+    region: Region = eqx.field(static=True)
+    losses: Losses = eqx.field(static=True)
+    reference: Reference = eqx.field(static=True)
+
+    def __init__(
+        self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
+    ):
+        self.delta, self.region = threshold(delta), one_of("region", region, Region)
+        self.heartbeat = None if heartbeat is None else check_count("heartbeat", heartbeat)
+        self.losses, self.reference = one_of("losses", losses, Losses), "prediction"
+
+
+class StochasticTrigger(AbstractTrigger):
+    """Transmit y with the probability 1 - exp(-(y - r)' W (y - r) / 2), W the weight, so that silence is Gaussian.
+
+    r is 0, or with `reference` "prediction" what both ends expect, as of `SendOnPredictionError`. losses "known": the
+    receiver knows at each step whether the link is up, so that silence and loss can be distinguished.
+
+    Shapes: weight () or (m, m).
+
+    Raises:
+        ValueError: a weight that is no positive definite matrix, an unknown reference or kind of losses.
+    Source: Han, Mo, Wu, Weerakkody, Sinopoli and Shi, Stochastic event-triggered sensor schedule for remote state
+        estimation (2015).
+    """
+
+    weight: Float[Array, "..."]
+    reference: Reference = eqx.field(static=True)
+    losses: Losses = eqx.field(static=True)
+    region: Region = eqx.field(static=True)
+    heartbeat: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        weight: ArrayLike,
+        reference: Literal["zero", "prediction"] = "zero",
+        losses: Literal["unknown", "known"] = "unknown",
+    ):
+        self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
+        if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
+            raise fail("weight", "a positive definite matrix", shown(self.weight.tolist()))
+        self.reference = one_of("reference", reference, Literal["zero", "prediction"])
+        self.losses = one_of("losses", losses, Literal["unknown", "known"])
+        self.region, self.heartbeat = "box", None
+
+    def matrix(self, outputs: int) -> jax.Array:
+        """W as a matrix (m, m)."""
+        weight = jnp.asarray(self.weight)
+        return weight * jnp.eye(outputs) if weight.ndim == 0 else weight
+
+    def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+        """A draw that exceeds exp(-e' W e / 2)."""
+        silent = jnp.exp(-error @ self.matrix(len(error)) @ error / 2)
+        return jnp.full(len(error), jax.random.uniform(key, dtype=float) > silent)
+
+    def known_losses(self, sender: Sender, reason: jax.Array, arrived: jax.Array) -> jax.Array:
+        """State of the link, 1 where it is down, whether or not anything is sent: so that silence stays Gaussian."""
+        return (~arrived).astype(float)[: self.side_information(len(arrived))]
+
+    def check_outputs(self, outputs: int) -> None:
+        """Raise ValueError unless the weight is one number or a matrix of so many components."""
+        if np.ndim(self.weight) and len(self.weight) != outputs:
+            raise fail(
+                "weight of the trigger", f"a number, or shape {(outputs, outputs)}", f"shape {self.weight.shape}"
+            )
+
+
+class Periodic(AbstractTrigger):
+    """Transmit y at the steps k = phase, phase + period, ...
+
+    Raises:
+        ValueError: a period that is no whole number from 1, a phase that is none from 0 to period - 1.
+    """
+
+    period: int = eqx.field(static=True)
+    phase: int = eqx.field(static=True)
+    reference: Reference = eqx.field(static=True)
+    losses: Losses = eqx.field(static=True)
+    region: Region = eqx.field(static=True)
+    heartbeat: int | None = eqx.field(static=True)
+
+    def __init__(self, period: int, phase: int = 0):
+        self.period, self.phase = check_count("period", period), check_count("phase", phase, 0)
+        if self.phase >= self.period:
+            raise fail("phase", f"a whole number below the period {self.period}", phase)
+        self.reference, self.losses, self.region, self.heartbeat = "zero", "unknown", "box", None
+
+    def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+        """k = phase (mod period)."""
+        return jnp.full(len(error), k % self.period == self.phase)
+
+    def _own_reason(self) -> int:
+        return SendReason.SCHEDULE
+
+
+def threshold(delta: ArrayLike) -> Float[Array, "..."]:
+    """A delta, which is positive, or one for each component."""
+    tell("delta", delta, POSITIVE)
+    result: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
+    if not is_traced(result) and not np.all(result > 0):
+        raise fail("delta", "a positive number, or one for each component", shown(np.asarray(result).tolist()))
+    return result
+
+
+def one_of(name: str, value: object, kinds: object) -> Any:
+    """One of the words of a type.
+
+    Raises:
+        ValueError: none of them.
+    """
+    words = get_args(kinds)
+    if not isinstance(value, str) or value not in words:
+        raise fail(name, f"one of {', '.join(words)}", shown(value))
+    return value

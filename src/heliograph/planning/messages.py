@@ -1,0 +1,295 @@
+"""Messages against error, before any data: rates of senders that decide, thresholds for a budget, and a bound."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
+from scipy.special import ndtr
+
+from heliograph.filters.event.factory import event_filter
+from heliograph.model.channel import Channel
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.trigger import AbstractTrigger
+from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.numerics.readable import readable
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.simulate import monte_carlo
+
+NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
+POINTS = 200  # of half a grid: a step of its law is 64 million products
+PRODUCTS = 2e10  # of an iteration: seconds
+RAREST = 1e-6  # rate of messages that a grid holds
+LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
+REACH = 12.0  # deviations at which a density ends
+
+
+@readable
+class MessageRate(NamedTuple):
+    """Rate of messages and mean square errors, with their standard errors, which are 0 where they are exact.
+
+    Args:
+        rate: transmissions a step.
+        error: mean square errors of the states, (n,).
+        rate_error: standard error of the rate.
+        error_error: standard errors of the errors, (n,).
+    """
+
+    rate: float
+    error: np.ndarray
+    rate_error: float
+    error_error: np.ndarray
+
+
+class _Scalar(NamedTuple):
+    """x+ = a x + N(0, q), y = c x + N(0, r)."""
+
+    a: float
+    q: float
+    c: float
+    r: float
+
+    @property
+    def kalman_variance(self) -> float:
+        """Error variance of the sender's Kalman filter in the long run."""
+        a, q, r = self.a, self.q, self.r / self.c**2
+        b = r * (1 - a * a) - q
+        prior = (-b + np.sqrt(b * b + 4 * q * r)) / 2
+        return float(prior * r / (prior + r))
+
+
+def simulated_rate(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    trigger: AbstractTrigger,
+    runs: int = 64,
+    horizon: int = 400,
+    seed: int = 0,
+) -> MessageRate:
+    """Rate and error of `event_filter` behind a rule, by simulation: any plant, any link.
+
+    Means over the last three quarters of the steps.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        channel: the link, with its losses.
+        trigger: the sender's rule.
+        runs: number of simulated runs.
+        horizon: steps of a run.
+        seed: seed of the draws.
+
+    Raises:
+        ValueError: parts that do not fit; counts below 2 runs and 4 steps.
+    """
+    check_count("runs", runs, 2)
+    check_count("horizon", horizon, 4)
+    item = event_filter(plant, sensor, channel, trigger)
+    node = Node(sensor, channel, {"event": item}, trigger=trigger)
+    record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
+    sent = record.transmissions["sender"][:, horizon // 4 :] != 0
+    by_run = sent.mean(axis=(1, 2))
+    squares = (record.errors("sender", "event")[:, horizon // 4 :] ** 2).mean(axis=1)
+    root = np.sqrt(runs)
+    return MessageRate(
+        float(by_run.mean()), squares.mean(axis=0), float(by_run.std(ddof=1) / root), squares.std(axis=0, ddof=1) / root
+    )
+
+
+def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss: float = 0.0) -> MessageRate:
+    """Rate and error of a sender with a Kalman filter that transmits its estimate where the prediction is off by delta.
+
+    The prediction is that from the last estimate that was acknowledged; each is lost with probability `loss`, and the
+    sender knows. With P the sender's variance and e the difference of its estimate and the prediction,
+
+        e+ = a e + N(0, s^2),  s^2 = P-^2 / (P- + R),     0 where an estimate arrives,
+
+    visits in silence from one arrival to the next: v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de), kappa = 1 within
+    delta, `loss` beyond; rate (1 + int_{|e| > delta} v) / T and error P + int e^2 v / T, T = 1 + int v. Exact.
+
+    Raises:
+        ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
+    Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
+    """
+    a, q, c, r = system = _scalar(plant, sensor)
+    delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
+    if not loss < 1:
+        raise fail("loss", "a number below 1", loss)
+    known = system.kalman_variance
+    prior = a * a * known + q
+    s = prior / np.sqrt(prior + r / c**2)
+    # Parts of the line, within delta and beyond, with nodes and weights; what is beyond counts where losses leave it.
+    far = delta + REACH * s / np.sqrt(1 - loss)
+    edges = [-far, -delta, delta, far] if loss else [-delta, delta]
+    if far > LONGEST * s:
+        raise fail(
+            "delta and loss", f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}", f"{far:.3g}"
+        )
+    nodes, weights = _rule(edges, s)
+    kappa = np.where(np.abs(nodes) <= delta, 1.0, loss)
+    kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights
+    visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights
+    cycle = 1 + visits.sum()
+    rate = (1 + visits[np.abs(nodes) > delta].sum()) / cycle
+    error = known + nodes**2 @ visits / cycle
+    return MessageRate(float(rate), np.array([error]), 0.0, np.zeros(1))
+
+
+def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0.0) -> float:
+    """Mean square error that no sender stays below who transmits at most at this rate and knows what arrived.
+
+    The curve of `prediction_error_rate`, whose thresholds are optimal for first-order plants: published for links
+    without loss (Lipsa and Martins 2011) and with losses that are acknowledged (Chakravorty and Mahajan 2020); here it
+    is computed, not proved.
+
+    Args:
+        plant: a linear plant of one state.
+        sensor: a linear sensor of one output.
+        rate: transmissions a step.
+        loss: probability that a transmission is lost.
+
+    Raises:
+        ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
+    """
+    delta = _threshold(rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _scalar(plant, sensor))
+    return float(prediction_error_rate(plant, sensor, delta, loss).error[0])
+
+
+def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> float:
+    """Transmissions a step of send-on-delta in the long run; losses change none, as the reference is the value sent.
+
+    From the stationary law of (x, r), r the reference, as a Markov chain on two grids of cells, extrapolated: to 1e-3
+    of itself where one step in a hundred sends, to 1 % at one in 2,500.
+
+    Raises:
+        ValueError: a plant or sensor of more than one state and output; a plant that is not stable; a delta so large
+            that less than one message in a million steps is sent; a grid that is too fine, or a rate that converges
+            too slowly to be computed.
+    """
+    rate = _send_on_delta_rate(_scalar(plant, sensor), float(scalar("delta", delta, TINY)))
+    if rate < RAREST:
+        raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
+    return rate
+
+
+def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
+    """The rate by two grids, however small."""
+    a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
+    if not abs(a) < 1:
+        raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
+    # The rectangle rule next to the cut at delta is wrong by a multiple of h^2: of two grids that is taken off.
+    (coarse, h), (fine, half) = (_rate_on_grid(system._replace(c=1.0, r=r), delta, share) for share in (0.8, 0.5))
+    return float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
+
+
+def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:
+    """The rate by a grid of cells of at most a share of the lesser noise's deviation, and the cells' length."""
+    a, q, _, r = system
+    deviation = np.sqrt(q / (1 - a * a))
+    # Cells that hold both noises, and reach over what is measured.
+    cells = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), 1e9) - 0.5))
+    h = delta / (cells + 0.5)  # delta is the edge of a cell
+    n = int(np.ceil(min(5.5 * np.sqrt(deviation**2 + r) / h, 1e9)))
+    if n > POINTS:
+        raise fail(
+            "plant, sensor and delta",
+            f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
+            f"{n / 5.5:.3g} times",
+        )
+    # A Markov chain of cells: probabilities of a cell given the middle of another, which sum to 1.
+    x = np.arange(-n, n + 1) * h
+    move, noise = _cells(x, a * x, np.sqrt(q)).T, _cells(x, x, np.sqrt(r))
+    quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
+    # The stationary law is the eigenvector of a step for its largest eigenvalue, 1.
+    size = 2 * n + 1
+    low, high = np.clip(np.arange(size) - cells, 0, None), np.minimum(np.arange(size) + cells + 1, size)
+
+    def event(f: np.ndarray) -> np.ndarray:
+        sums = np.cumsum(np.pad(f, ((0, 0), (1, 0))), axis=1)
+        return np.asarray((sums[:, -1:] - sums[:, high] + sums[:, low]) * noise)
+
+    def step(vector: np.ndarray) -> np.ndarray:
+        f = move @ vector.reshape(size, size)
+        return np.asarray(f * quiet + event(f)).ravel()
+
+    start = _cells(x, np.zeros(1), deviation).T * noise
+    operator = LinearOperator((size**2, size**2), matvec=step, dtype=np.float64)
+    try:
+        _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=int(PRODUCTS / size**3 / 20) + 2, tol=1e-9)
+    except ArpackError as why:
+        raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
+    f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
+    return float(event(move @ f).sum()), h
+
+
+def _cells(x: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
+    """Probabilities (mean, cell) that a Gaussian falls into the cell around x; the outermost reach to infinity."""
+    edges = np.concatenate([[-np.inf], (x[1:] + x[:-1]) / 2, [np.inf]])
+    return np.diff(ndtr((edges - means[:, None]) / deviation), axis=1)
+
+
+def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
+    """The delta with which send-on-delta transmits at a rate, by bisection of `send_on_delta_rate`.
+
+    Args:
+        plant: a linear plant of one state.
+        sensor: a linear sensor of one output.
+        rate: transmissions a step.
+
+    Raises:
+        ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
+    """
+    system = _scalar(plant, sensor)
+    return _threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, 1e-3)
+
+
+def _threshold(rate: float, of: Callable[[float], float], system: _Scalar, accuracy: float = 1e-10) -> float:
+    """Find the threshold at which a rate that falls with delta has a value."""
+    if not 0 < scalar("rate", rate) < 1:
+        raise fail("rate", "a number between 0 and 1", rate)
+    unit = np.sqrt(system.q * system.c**2 + system.r)
+    low = high = unit
+    while of(low) < rate:
+        low /= 2
+    while of(high) > rate:
+        high *= 2
+    return float(brentq(lambda delta: of(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
+
+
+def _scalar(plant: AnyPlant, sensor: AnySensor) -> _Scalar:
+    """A linear plant and sensor of one state and one output."""
+    linear = isinstance(plant, LinearPlant) and isinstance(sensor, LinearSensor)
+    if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor) or len(plant.states) != 1:
+        got = "several states" if linear else f"{type(plant).__name__} and {type(sensor).__name__}"
+        raise fail("rate before any data", "a LinearPlant and LinearSensor of one state and output", got)
+    if len(sensor.outputs) != 1:
+        raise fail("rate before any data", "one output", f"{len(sensor.outputs)}")
+    q = float(np.asarray(plant.noise_covariance(jnp.zeros(0)))[0, 0])
+    numbers = (
+        np.asarray(plant.matrix)[0, 0],
+        q,
+        np.asarray(sensor.matrix)[0, 0],
+        np.asarray(sensor.noise.covariance)[0, 0],
+    )
+    return _Scalar(*map(float, numbers))
+
+
+def _rule(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights of parts of a line, each cut to lengths of at most 8 units."""
+    x, w = np.polynomial.legendre.leggauss(NODES)
+    parts = []
+    for a, b in pairwise(edges):
+        cuts = np.linspace(a, b, int(np.ceil((b - a) / (8 * unit))) + 1)
+        parts += list(pairwise(cuts))
+    nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in parts])
+    return nodes, np.concatenate([(b - a) / 2 * w for a, b in parts])
+
+
+def _normal(e: np.ndarray, variance: float) -> np.ndarray:
+    return np.asarray(np.exp(-(e**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance))

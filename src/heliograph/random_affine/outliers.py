@@ -1,0 +1,317 @@
+"""Noise laws with outliers: Student's and contaminated Gaussian noise, and the branches that a robust filter reads."""
+
+from collections.abc import Sequence
+from math import prod
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar
+from heliograph.numerics.traced import is_traced, library, plain, scipy_for
+from heliograph.random_affine.moments.monomials import Exponents
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
+
+PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
+"""Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
+LEAST_SHARE = 1e-12  # of each of them: none is excluded
+
+Stack = Float[jax.Array | np.ndarray, "branches n n"]
+
+
+class StudentT(AbstractNoise):
+    """Student's t noise: Gaussian noise of covariance `scale` / l with one l of the gamma law of mean 1 for the vector.
+
+    l is chi-squared of `degrees` nu divided by nu. Its covariance is scale nu / (nu - 2), which exists above 2 degrees;
+    a filter that needs it refuses fewer. Large nu is Gaussian noise.
+
+    Shapes: scale (n, n), or a number for one component.
+
+    Raises:
+        ValueError: a scale that is no covariance, degrees that are not positive.
+    Source: Lange, Little and Taylor, Robust statistical modeling using the t distribution (1989).
+    """
+
+    scale: Square
+    degrees: Float[jax.Array | np.ndarray, ""]
+    mean: Vector
+
+    def __init__(self, scale: ArrayLike, degrees: ArrayLike):
+        self.scale = covariance("scale of Student's law", scale, _size(scale))
+        self.degrees = scalar("degrees of Student's law", degrees, TINY)
+        self.mean = np.zeros(self.scale.shape[-1])
+
+    @property  # type: ignore[misc]
+    def covariance(self) -> Square:  # type: ignore[override]
+        """The scale times nu / (nu - 2).
+
+        Raises:
+            ValueError: at most 2 degrees.
+        """
+        nu = self.degrees
+        if not is_traced(nu) and nu <= 2:
+            expected = "more than 2, below which it has no covariance (robust_filter with its score update needs none)"
+            raise fail("degrees of Student's law", expected, f"{float(nu):g}")
+        result: Square = self.scale * (nu / (nu - 2))
+        return result
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw A w / sqrt(l), w standard normal."""
+        first, second = jax.random.split(key)
+        half = jnp.asarray(self.degrees, dtype=float) / 2
+        precision = jax.random.gamma(second, half, dtype=float) / half
+        return Gaussian(self.scale).sample(first) / jnp.sqrt(precision)
+
+    def moment(self, powers: Exponents) -> Number:
+        """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
+
+        Raises:
+            ValueError: an order of at least `degrees`, whose moment does not exist.
+        """
+        order, nu = sum(powers), self.degrees
+        if order % 2:
+            return 0.0
+        if not is_traced(nu) and 0 < nu <= order:
+            raise fail(f"degrees of Student's law in moments of order {order}", f"more than {order}", f"{float(nu):g}")
+        return prod((plain(nu / (nu - 2 * i)) for i in range(1, order // 2 + 1)), start=1.0) * Gaussian(
+            self.scale
+        ).moment(powers)
+
+
+class Contaminated(AbstractNoise):
+    """Gaussian noise with outliers: covariance R, and with probability `share` mean `bias` and `outlier_covariance`.
+
+    Outlying branches of several kinds have a list of shares, with as many covariances (or variances) and biases. The
+    covariance of the whole is sum_j p_j (R_j + m_j m_j') - m m', its mean m = sum_j p_j m_j.
+
+    `bounded`: the share is at most this one and the outliers' second moment at most this one (`at_most`), so that the
+    covariance dominates and filters claim "upper" where they else claim "exact".
+
+    Shapes: covariance, outlier_covariance (n, n) or a number; share a number; bias a number or (n,). Of several
+    kinds: share (kinds,), outlier_covariance (kinds,) or (kinds, n, n), bias (kinds,) or (kinds, n).
+
+    Raises:
+        ValueError: a share outside [0, 1] (or several whose sum is), covariances that are none, shapes that do not fit.
+    Source: Tukey, A survey of sampling from contaminated distributions (1960).
+    """
+
+    shares: Vector
+    means: Matrix
+    covariances: Stack
+    mean: Vector
+    covariance: Square
+    bounded: bool = eqx.field(static=True)
+
+    def __init__(self, covariance_: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        inlier = covariance("covariance of contaminated noise", covariance_, _size(covariance_))
+        n = inlier.shape[-1]
+        parts, several = _shares(share)
+        outliers = _several("covariance of the outliers", outlier_covariance, len(parts), several)
+        biases = _several("bias of the outliers", bias, len(parts), several)
+        xp = library(inlier, parts, outliers, biases)
+        spreads = [covariance("covariance of the outliers", r, n) for r in outliers]
+        centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
+                   for b in biases]  # fmt: skip
+        # The first branch is the noise without outliers; the moments are those of the mixture.
+        self.shares = xp.concatenate([xp.stack([1 - sum(parts)]), xp.stack(parts)])
+        self.means = xp.stack([xp.zeros(n), *centers])
+        self.covariances = xp.stack([inlier, *spreads])
+        self.mean = self.shares @ self.means
+        apart = self.means - self.mean
+        self.covariance = xp.einsum("j,jab->ab", self.shares, self.covariances + apart[:, :, None] * apart[:, None])
+        self.bounded = False
+
+    @classmethod
+    def one_sided(cls, covariance_: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
+        """Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
+
+        The exponential law as `slices` of equal probability, each with its mean and variance: the mean and the variance
+        of the whole are those of the law. `mean` is a number or one for each component, of either sign.
+
+        Raises:
+            ValueError: as for the class; no slice.
+        """
+        count = check_count("slices of an exponential bias", slices)
+        inlier = covariance("covariance of contaminated noise", covariance_, _size(covariance_))
+        n = inlier.shape[-1]
+        factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
+        center, variance = _exponential_slices(count)
+        xp = library(factor, inlier, share)
+        units = xp.broadcast_to(factor, (n,))
+        part = scalar("share of outliers", share, 0.0, 1.0) / count
+        spreads = [inlier + v * xp.outer(units, units) for v in variance]
+        return cls(inlier, [part] * count, spreads, [m * units for m in center])
+
+    @classmethod
+    def at_most(cls, covariance_: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
+        """Noise of mean zero of which bounds are known: at most this share of outliers, E[o o'] at most this matrix.
+
+        (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
+
+        Raises:
+            ValueError: as for the class; a second moment of outliers that does not dominate the covariance.
+        """
+        law = cls(covariance_, share, outlier_second_moment)
+        if not is_traced(law.covariances):
+            least = np.min(np.linalg.eigvalsh(law.covariances[1] - law.covariances[0]))
+            if least < -1e-10 * np.max(np.abs(law.covariances[1])):
+                raise fail("second moment of the outliers", "one that is at least the covariance of the others",
+                           f"a difference with eigenvalue {least:.3g}")  # fmt: skip
+        object.__setattr__(law, "bounded", True)
+        return law
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the branch, then from it."""
+        first, second = jax.random.split(key)
+        edges = jnp.cumsum(jnp.asarray(self.shares))[:-1]
+        branch = jnp.sum(jax.random.uniform(first, dtype=float) > edges)
+        factors = jnp.stack([jnp.asarray(Gaussian(r).factor) for r in self.covariances])
+        return jnp.asarray(self.means)[branch] + factors[branch] @ jax.random.normal(
+            second, self.mean.shape, dtype=float
+        )
+
+    def moment(self, powers: Exponents) -> Number:
+        """Return the mean of the branches' moments."""
+        items = zip(self.shares, self.covariances, self.means, strict=True)
+        return sum((plain(p) * Gaussian(r, m).moment(powers) for p, r, m in items), start=0.0)
+
+
+class Branches(NamedTuple):
+    """Each component of a noise as a mixture of Gaussian branches about the mean of the noise.
+
+    Shapes: log_share, mean, variance (n, branches); a branch that a component does not have has log_share -inf.
+    """
+
+    log_share: Matrix
+    mean: Matrix
+    variance: Matrix
+
+
+def branches(noise: AbstractNoise) -> Branches:
+    """Branches of each component: those of the law, 25 of Student's, one of any other law, with its two moments."""
+    match noise:
+        case Independent():
+            return _stacked([branches(part) for part in noise.parts])
+        case Contaminated():
+            xp, n = library(noise.shares), noise.dimension
+            shares = xp.broadcast_to(_log(noise.shares), (n, len(noise.shares)))
+            variances = xp.diagonal(noise.covariances, axis1=1, axis2=2).T
+            return Branches(shares, (noise.means - noise.mean).T, variances)
+        case StudentT():
+            xp, n = library(noise.degrees, noise.scale), noise.dimension
+            shape = (n, len(PRECISIONS))
+            shares = xp.broadcast_to(_log(precision_shares(noise.degrees)), shape)
+            return Branches(shares, np.zeros(shape), xp.diagonal(noise.scale)[:, None] / PRECISIONS)
+    variances = library(noise.covariance).diagonal(noise.covariance)[:, None]
+    return Branches(np.zeros((noise.dimension, 1)), np.zeros((noise.dimension, 1)), variances)
+
+
+def precision_shares(degrees: ArrayLike) -> Vector:
+    """Mass of the gamma law of l between the geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
+    xp: Any = library(degrees)
+    half = xp.asarray(degrees) / 2
+    between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
+    below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half, between.shape), between * half)
+    masses = xp.diff(xp.concatenate([np.zeros(1), below, np.ones(1)]))
+    masses = xp.maximum(masses, LEAST_SHARE)
+    result: Vector = masses / xp.sum(masses)
+    return result
+
+
+class Nominal(NamedTuple):
+    """The noise without its outliers: mean (n,), relative to that of the whole, and covariance (n, n)."""
+
+    mean: Vector
+    covariance: Square
+
+
+def nominal(noise: AbstractNoise) -> Nominal:
+    """The first branch of contaminated noise, the scale of Student's, the law's own moments else."""
+    match noise:
+        case Independent():
+            items = [nominal(part) for part in noise.parts]
+            xp, block = library(items), scipy_for(items).linalg.block_diag
+            return Nominal(xp.concatenate([part.mean for part in items]), block(*[part.covariance for part in items]))
+        case Contaminated():
+            return Nominal(noise.means[0] - noise.mean, noise.covariances[0])
+        case StudentT():
+            return Nominal(np.zeros(noise.dimension), noise.scale)
+    return Nominal(np.zeros(noise.dimension), noise.covariance)
+
+
+def has_outliers(noise: AbstractNoise) -> bool:
+    """Ask whether the law says that there are outliers."""
+    if isinstance(noise, Independent):
+        return any(has_outliers(part) for part in noise.parts)
+    return isinstance(noise, StudentT | Contaminated)
+
+
+def is_bounded(*parts: PyTree) -> bool:
+    """Ask whether some noise in these parts of a network is known by a bound of its covariance alone."""
+
+    def is_law(item: object) -> bool:
+        return isinstance(item, Contaminated)
+
+    return any(leaf.bounded for leaf in jax.tree.leaves(parts, is_leaf=is_law) if is_law(leaf))
+
+
+def _size(value: ArrayLike) -> int | None:
+    return None if rank("covariance", value) else 1
+
+
+def _shares(share: ArrayLike) -> tuple[list[Number], bool]:
+    """Shares of the kinds of outliers, and whether a list of them was given."""
+    if not rank("share of outliers", share):
+        return [scalar("share of outliers", share, 0.0, 1.0)], False
+    values = array("shares of outliers", share, ("kinds",))
+    total = sum(scalar("share of outliers", part, 0.0, 1.0) for part in values)
+    scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12) if not is_traced(total) else None
+    return list(values), True
+
+
+def _several(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
+    if not several:
+        return [value]
+    if not rank(name, value):
+        return [value] * count
+    parts: list[ArrayLike] = list(cast(Sequence[ArrayLike], value))
+    if len(parts) != count:
+        raise fail(name, f"one for each of the {count} shares", len(parts))
+    return parts
+
+
+def _exponential_slices(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of the exponential law of mean 1 between its quantiles k / count.
+
+    With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
+    """
+    survival = 1 - np.arange(count + 1) / count
+    time = -np.log(np.where(survival > 0, survival, 1.0))
+    first = count * -np.diff(survival * (time + 1))
+    second = count * -np.diff(survival * (time**2 + 2 * time + 2))
+    return first, second - first**2
+
+
+def _log(value: Vector) -> Vector:
+    """Logarithms, -inf of zero without a warning."""
+    if is_traced(value):
+        return jnp.log(value)
+    with np.errstate(divide="ignore"):
+        result: Vector = np.log(np.maximum(value, 0.0))
+    return result
+
+
+def _stacked(parts: list[Branches]) -> Branches:
+    """Components of several laws one above the other, as many branches each as the one with most has."""
+    xp, most = library(parts), max(part.mean.shape[1] for part in parts)
+    fills = (-np.inf, 0.0, 1.0)
+
+    def padded(part: Branches) -> list[Matrix]:
+        more = ((0, 0), (0, most - part.mean.shape[1]))
+        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(part, fills, strict=True)]
+
+    return Branches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))

@@ -1,0 +1,10 @@
+"""Moments of what a channel delivers, given what was sent."""
+
+import numpy as np
+
+from heliograph.random_affine.moments.monomials import monomials
+
+
+def conditional_moments(channel, y, order):
+    """E[mono_order(z) | y] for a given point y (inputs,)."""
+    return channel.moments(order).expect(monomials(np.asarray(y, dtype=float), order))
