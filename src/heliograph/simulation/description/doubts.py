@@ -77,6 +77,7 @@ def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[
     Linear plants and sensors have it everywhere, others at a state drawn around the initial mean, since a symmetric
     point may hide what every other one shows.
     """
+    # A state drawn around the initial mean, and unit inputs.
     n = len(plant.states)
     spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
     point = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=n)
@@ -95,6 +96,7 @@ def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[
 
 def _unbounded(network: Network) -> Iterator[Doubt]:
     """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
+    # All nodes together, then each that has filters.
     yield from _bound(network, "the mean error of every filter", True)
     alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
     if len(network.nodes) == 1 or not alone:
