@@ -28,8 +28,8 @@ def link_in_words(channel: Channel) -> str:
 
 def _words(channel: AbstractRandomAffine) -> str:
     """Return a map in words; nothing for one that only selects components."""
-    # One case for each way of making a channel.
     match channel:
+        # One case for each way of making a channel.
         case GainAndNoise():
             return _hop(channel)
         case Series():
