@@ -4,8 +4,8 @@ Public names are listed in `__init__.pyi`, in the order data flows, and loaded w
 import path.
 """
 
-import lazy_loader
+from heliograph.numerics.names import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
 
 __version__ = "0.2.0"

@@ -100,3 +100,45 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     (tmp_path / "mine" / "thesis").touch()
     assert cli.main([*arguments[:-1], "mine"]) == 2 and "other files" in capsys.readouterr().err
     assert cli.main(arguments[:-2]) == 2 and "(--out FILE) or a folder for a report" in capsys.readouterr().err
+
+
+def test_the_fused_estimate_comes_first_and_what_is_not_drawn_is_named(fits):
+    """Ten nodes and a centre: eight are drawn, the centre first, and the others are named."""
+    sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["height"])
+    nodes = {f"n{i}": hg.Node(sensor, hg.perfect(), {"kalman": hg.kalman_filter(PLANT, sensor)}) for i in range(10)}
+    network = hg.Network(PLANT, nodes, {"all": hg.Fusion("kalman", hg.CovarianceIntersection())})
+    received = np.random.default_rng(0).normal(size=(10, 60, 1))
+    record = hg.run(network, dict(zip(nodes, received, strict=True)))
+    health_ = examine(network, record, np.zeros((60, 0)))
+    figures = run_figures(health_)
+    page = run_page(health_, "net", dict.fromkeys(figures, b"<svg/>")).html()
+    fits(page)
+    assert page.index("fused: estimates with bands") < page.index("n0: estimates with bands")
+    assert "Not drawn, for lack of room: n7, n8, n9." in page
+    assert "Not drawn, for lack of room: n8/kalman, n9/kalman." in page
+    legend = figures["innovations"].axes[0].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["height"]
+
+
+CENTRAL = """
+import numpy as np
+import heliograph as hg
+
+plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0, states=["level"])
+sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["y"])
+both = hg.LinearSensor([[1.0], [1.0]], 0.1)
+nodes = {name: hg.Node(sensor, hg.perfect(), {}) for name in ("a", "b")}
+network = hg.Network(plant, nodes, {"centre": hg.kalman_filter(plant, both)})
+"""
+
+
+def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.py").write_text(CENTRAL)
+    rows = [f"{k},{np.sin(k)},{np.cos(k)}" for k in range(40)]
+    (tmp_path / "data.csv").write_text("\n".join(["time,a.y,b.y", *rows]))
+    arguments = ["run", "net.py", "--measurements", "data.csv", "--out", "out.csv", "--report", "report"]
+    assert cli.main(arguments) == 0
+    assert (tmp_path / "out.csv").read_text().startswith("time,fused.level,fused.level.sd,fused.valid\n")
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "fused: estimates with bands" in page and "fused/centre" in page

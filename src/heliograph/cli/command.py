@@ -2,12 +2,13 @@
 
 import errno
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from cyclopts import CycloptsError
 
 from heliograph.cli.app import app, completion
+from heliograph.cli.check import check
 from heliograph.cli.design import design
 from heliograph.cli.export import export
 from heliograph.cli.fit import fit
@@ -25,10 +26,26 @@ from heliograph.simulation.runs.compilation_cache import keep_compilations
 BAD_INPUT = 2
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO  # files name themselves, what is printed does not
 
-# In the order of the help.
-COMMANDS = new, inspect, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
-for single in COMMANDS:
-    app.command(single)
+# In the order of the help, each with a call of it.
+COMMANDS: dict[Callable[..., object], str] = {
+    new: "my_network.py",
+    check: "my_network.py",
+    inspect: "drive.mcap --network my_network.py",
+    run: "my_network.py --measurements data.csv --out estimates.csv --report report",
+    fit: "my_network.py --measurements data.csv --out fitted",
+    serve: "my_network.py --broker mqtt://localhost:1883/plants --page 8000",
+    replay: "data.csv --network my_network.py --speed 10 --loss 0.1 | heliograph serve my_network.py --store none",
+    export: "my_network.py --filter relay_aware --out step.c",
+    demo: "--out demo",
+    example: "fusion --out fusion",
+    reproduce: "quadratic-bias --out quadratic-bias",
+    sweep: "campaign.toml --out results",
+    explore: "results --out page",
+    design: "design.toml --out designed",
+    completion: "bash >> ~/.bashrc",
+}
+for single, arguments in COMMANDS.items():
+    app.command(single, help_epilogue=f"Example: heliograph {single.__name__} {arguments}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

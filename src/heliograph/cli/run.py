@@ -71,7 +71,7 @@ def run(
 
         # Messages of a bag become events; a network's file says which.
         loaded, module = load_module(network)
-        if not any(node.filters for node in loaded.nodes.values()):
+        if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         messages = read_mapped(measurements, network, loaded, module, advance)
         write = _writer(messages, module)
@@ -196,5 +196,5 @@ def _write_report(name: str, network: "Network", record: "Record", recording: "R
 
         return run_results(health, name)
 
-    count = sum(len(node.filters) for node in network.nodes.values())
+    count = sum(map(len, network.claims().values()))
     write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), tell)

@@ -1,5 +1,5 @@
 """Native code: a traced function of one run as scalar operations, compiled for many runs at once."""
 
-import lazy_loader
+from heliograph.numerics.names import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

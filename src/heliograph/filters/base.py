@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, NoReturn, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module
+from heliograph.numerics.names import offered
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
@@ -31,6 +32,12 @@ Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+INSTEAD = {  # what other packages call what a filter does here
+    "update": "filter.correct(state, z), or filter.step(state, z, u), which predicts too",
+    "filter": "filter.run(z, u) for rows of measurements",
+    "smooth": "hg.rts_smoother(filter, z, u)",
+}
 
 
 @readable
@@ -55,6 +62,17 @@ class AbstractFilter(Module):
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
     received: eqx.AbstractVar[int]
+
+    if not TYPE_CHECKING:  # a type checker knows all attributes
+
+        def __getattr__(self, name: str) -> NoReturn:
+            """Refuse an attribute that does not exist with what to write instead, or the names most like it."""
+            kind = type(self)
+            if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
+                object.__getattribute__(self, name)
+            public = {item: f"filter.{item}" for item in dir(kind) if not item.startswith("_")}
+            remedy = f"; write {INSTEAD[name]}" if name in INSTEAD else offered(name, public)
+            raise AttributeError(f"{kind.__name__} has no attribute {name!r}{remedy}")
 
     def init(self) -> PyTree:
         """Return the state of the filter before the first step."""

@@ -209,4 +209,6 @@ def check_link(
 def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
     """Raise ValueError unless a channel takes as many numbers as the sensor sends."""
     if sent(channel) != len(sensor.outputs):
-        raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{sent(channel)} inputs")
+        outputs = len(sensor.outputs)
+        expected = f"one for the sensor's {outputs} output{'s' * (outputs > 1)}, such as perfect({outputs})"
+        raise fail("channel", expected, f"one that takes {sent(channel)}")

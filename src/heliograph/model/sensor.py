@@ -19,6 +19,8 @@ from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
+LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
+
 
 @readable
 class AbstractSensor(Module):
@@ -68,7 +70,9 @@ class Sensor(AbstractSensor):
             noise and erasures.
 
     Raises:
-        ValueError: names, noise and function that disagree about the number of outputs, circular outputs that are none.
+        ValueError: names and noise that disagree about the number of outputs, a variance alone of a function that
+            returns more than one, circular outputs that are none. A network or filter refuses any other function that
+            returns another number of outputs.
     """
 
     function: Callable[[jax.Array], ArrayLike]
@@ -86,6 +90,11 @@ class Sensor(AbstractSensor):
         dimension = (components(noise) or 1) if outputs is None else len(items("sensor outputs", outputs, "names"))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
+        # A variance alone says nothing of the number of outputs, so the function is asked.
+        shape = (1,) if outputs is not None or components(noise) is not None else _shape_of(measure)
+        if shape != (1,):
+            expected = "one output, as a variance without names means (outputs=[...] names more)"
+            raise fail("measure of a sensor", expected, f"shape {shape}")
         self.circular = _circular(self.outputs, circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
@@ -127,6 +136,26 @@ class LinearSensor(AbstractSensor):
         """The same of the matrix, without a trace, of which each of many nodes would need its own."""
         if self.matrix.shape[-1] != states:
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
+
+
+def _shape_of(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
+    """Return the shape of h(x) where it is that of every state it takes; (1,) where that depends on the state.
+
+    What slices x gives another shape at each of two lengths; what unpacks x takes a state of one length alone.
+    """
+
+    def shape(states: int) -> tuple[int, ...] | None:
+        try:
+            with jax.enable_x64(True):
+                return tuple(jax.eval_shape(lambda x: jnp.asarray(measure(x)), np.zeros(states)).shape)
+        except Exception:  # not for this length; what is wrong for all is said where the plant is known
+            return None
+
+    first_, second = (shape(states) for states in LONG)
+    if first_ is not None and second is not None:
+        return first_ if first_ == second else (1,)
+    taken = [item for states in SHORT if (item := shape(states)) is not None]
+    return taken[0] if len(taken) == 1 else (1,)
 
 
 def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:

@@ -37,9 +37,14 @@ def shown(value: object) -> str:
 
 
 def shown_error(error: Exception) -> str:
-    """Return an error as a short part of one line; for NumPy where JAX has to trace, what to write instead."""
-    if isinstance(error, jax.errors.TracerArrayConversionError):
-        return "one that calls NumPy: write it with jax.numpy"
+    """Return an error of a user's function as a short part of one line; where JAX cannot trace, what to write."""
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return "one that decides by a value: write jnp.where"
+    for raised in (error, error.__cause__):
+        if isinstance(raised, jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError):
+            return "one that calls NumPy or math: write it with jax.numpy"
+    if isinstance(error, TypeError) and "immutable" in str(error):
+        return "one that assigns to a part of x: write jnp.stack, or x.at[i].set(value)"
     return " ".join(f"{type(error).__name__}: {error}".split())[:120]
 
 
@@ -70,7 +75,10 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
 
 def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
     """Return a shape in words, with an example of a table where something else came."""
-    lengths = ", ".join("any" if length is None else str(length) for length in shape)
+    if shape == (None,):
+        return "a list of numbers, such as [1, 0]"
+    free = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)
+    lengths = ", ".join(str(free[i] if length is None else length) for i, length in enumerate(shape))
     example = ", such as [[1, 0]]" if len(shape) == 2 and dimensions < 2 else ""
     return f"shape ({lengths}){example}"
 

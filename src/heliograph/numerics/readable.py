@@ -34,7 +34,7 @@ def _repr(self: object) -> str:
     parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_parts(self), LINES - 2)]
     left = sum(1 for _ in _parts(self)) - len(parts)
     more = [f"  … {left} more"] if left else []
-    return "\n".join([f"{type(self).__name__}(", *(_cut(part) for part in (*parts, *more)), ")"])
+    return "\n".join([f"{type(self).__name__}(", *(cut(part) for part in (*parts, *more)), ")"])
 
 
 def _html(self: object) -> str:
@@ -107,7 +107,8 @@ def _joined(start: str, items: Iterable[E], count: int, depth: int, of: Callable
     return f"{start}{', '.join([*map(of, islice(items, SOME)), *more])}{end}"
 
 
-def _cut(text: str) -> str:
+def cut(text: str) -> str:
+    """Return a line of at most WIDTH characters."""
     return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
 
 
@@ -125,6 +126,6 @@ def _entries(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _cell(value: object, depth: int) -> str:
-    text = escape(_cut(line(value, depth)))
+    text = escape(cut(line(value, depth)))
     opens = _ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_table(value, depth)}</details>" if opens and depth > 0 else text

@@ -2,6 +2,6 @@
 
 Knows nothing of filters or networks. Start with `base`, then `atoms` and `combine`; filters read `second_order`."""
 
-import lazy_loader
+from heliograph.numerics.names import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -44,7 +44,7 @@ class GainAndNoise(AbstractRandomAffine):
         if not isinstance(law, AbstractLaw):
             raise fail("gain of a hop", "a law (Constant for a number)", shown(law))
         self.law = law
-        self.matrix = array("gain matrix", matrix, (None, None))
+        self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     @property
@@ -132,6 +132,6 @@ def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | N
     Raises:
         ValueError: shapes that do not fit, or numbers that are not finite.
     """
-    a = array("matrix", matrix, (None, None))
+    a = array("matrix", matrix, ("outputs", "inputs"))
     b = np.zeros(a.shape[0]) if offset is None else array("offset", offset, (a.shape[0],))
     return GainAndNoise(Constant(1.0), a, Gaussian(np.zeros((a.shape[0], a.shape[0])), b))

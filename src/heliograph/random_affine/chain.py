@@ -116,7 +116,7 @@ class MarkovChain(AbstractMemory):
         radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
         tell("transition matrix", transition, SIMPLEX, PROBABILITY)
-        self.transition = rows = array("transition matrix", transition, (None, None))
+        self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
         if rows.shape[0] != rows.shape[1] or not rows.size:
             raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")
         for i, row in enumerate(rows):

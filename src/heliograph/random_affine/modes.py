@@ -165,7 +165,7 @@ class Faded(AbstractModal):
             raise fail("drift", "an Autoregression", shown(drift))
         self.memory, self.mean = drift, scalar("mean gain", mean)
         self.deviation = scalar("deviation of the gain", deviation, 0.0)
-        self.matrix = array("gain matrix", matrix, (None, None))
+        self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     @property

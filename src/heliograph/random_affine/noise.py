@@ -130,7 +130,7 @@ class FiniteSupport(AbstractNoise):
     covariance: Square
 
     def __init__(self, atoms: "Float[ArrayLike, 'atom component']", probabilities: "Float[ArrayLike, ' atom']"):
-        self.atoms = array("noise atoms", atoms, (None, None))
+        self.atoms = array("noise atoms", atoms, ("atoms", "components"))
         self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
         centred = self.atoms - self.mean

@@ -1,5 +1,5 @@
 """Relays that filter and forward: second moments, gains, power, receivers."""
 
-import lazy_loader
+from heliograph.numerics.names import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

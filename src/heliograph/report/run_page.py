@@ -1,6 +1,6 @@
 """Report of a run over a recording: estimates with bands, innovations, links, and warnings."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import matplotlib
@@ -15,6 +15,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
+from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
@@ -43,11 +44,28 @@ def run_figures(health: Health) -> dict[str, Figure]:
 
 
 def _nodes(record: Record) -> list[str]:
-    return [node for node, filters in record.estimates.items() if filters][:MOST]
+    """Return the nodes that are drawn, the fused estimate first."""
+    return _ordered(record)[:MOST]
+
+
+def _ordered(record: Record) -> list[str]:
+    return sorted((node for node, filters in record.estimates.items() if filters), key=lambda node: node != FUSED)
 
 
 def _tested(health: Health) -> list[FilterHealth]:
-    return [tested_filter for tested_filter in health.filters if tested_filter.white is not None][:MOST]
+    return _testable(health)[:MOST]
+
+
+def _testable(health: Health) -> list[FilterHealth]:
+    tested = (item for item in health.filters if item.white is not None)
+    return sorted(tested, key=lambda item: item.node != FUSED)
+
+
+def _not_drawn(names: Sequence[str], where: str) -> list[Text]:
+    """Return what a figure leaves out for lack of room, by name, and where its numbers are."""
+    if not names:
+        return []
+    return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
 
 
 @matplotlib.rc_context(LOOK)
@@ -64,16 +82,27 @@ def _estimates(health: Health, record: Record, node: str) -> Figure:
 def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    names = _components(health)
     for axes, item in zip(grid, tested, strict=True):
         white = np.asarray(item.white)
         for i, component in enumerate(white.T):
-            axes.plot(health.record.time, component, ".", markersize=3, color=COLOURS[i % len(COLOURS)])
+            name, colour = names[item.node][i], COLOURS[i % len(COLOURS)]
+            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=in_figure(name))
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
         axes.set_title(in_figure(f"{item.node}/{item.filter}"))
         axes.set_ylabel("in deviations")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
     _time_axis(health, grid[-1])
     return figure
+
+
+def _components(health: Health) -> dict[str, list[str]]:
+    """Return the names of the measurement's components by node; of a central filter those of all nodes."""
+    names: dict[str, list[str]] = {}
+    for link in health.links:
+        names.setdefault(link.node, []).append(link.component)
+    return names | {FUSED: [f"{link.node}: {link.component}" for link in health.links]}
 
 
 @matplotlib.rc_context(LOOK)
@@ -128,7 +157,14 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         + _agreement(health, doubts),
         sections=[
             Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
-            Section("Estimates", [*errors_table(record), *estimates]),
+            Section(
+                "Estimates",
+                [
+                    *errors_table(record),
+                    *estimates,
+                    *_not_drawn(_ordered(record)[MOST:], "Their estimates are in the record."),
+                ],
+            ),
             Section("Innovations", _tests(health, drawings)),
             Section("Links", _health(health, drawings)),
         ],
@@ -199,10 +235,12 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
     # The innovations themselves, if any filter has some.
     picture = [Picture(drawings["innovations"], "Innovations over time in claimed deviations",
-                       f"Innovations in claimed standard deviations, one colour a component; 5 of 100 may lie beyond "
+                       f"Innovations in claimed standard deviations, one colour an output; 5 of 100 may lie beyond "
                        f"±{BAND:g}.")
                ] if "innovations" in drawings else []  # fmt: skip
-    return [Text([text]), Table(["filter", "claim", "size", "correlation", "p"], rows, caption), *picture]
+    left = [f"{item.node}/{item.filter}" for item in _testable(health)[MOST:]]
+    table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
+    return [Text([text]), table, *picture, *_not_drawn(left, "Their numbers are in the table.")]
 
 
 def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
@@ -213,9 +251,11 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
         name = visible(f"{link.node}: {link.component}")
         rows.append([name, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
     headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
-    caption = "When each component arrived (blue, above) and when it did not (red, below)."
+    caption = "When each component arrived (blue, above) and when it did not (orange, below)."
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    return [Table(headers, rows), *picture, *shared_text(health.shared)]
+    left = [f"{link.node}: {link.component}" for link in health.links[3 * MOST :]]
+    not_drawn = _not_drawn(left, "Their numbers are in the table.")
+    return [Table(headers, rows), *picture, *not_drawn, *shared_text(health.shared)]
 
 
 def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:

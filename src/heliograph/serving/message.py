@@ -1,5 +1,6 @@
 """Messages that a service receives: one event of one plant, as JSON; the schema is documentation for senders."""
 
+import json
 from datetime import datetime
 from shlex import quote
 from typing import Annotated, TypeAlias
@@ -81,9 +82,18 @@ def read_message(payload: bytes) -> Message:
         part = str(first["loc"][0]) if first["loc"] else ""
         if part not in EXPECTED:  # no JSON object, or one with a field more
             fields = f"a JSON object with no fields but {', '.join(EXPECTED)}"
-            raise fail("message", fields, shown(part) if part else f"{shown(payload)} ({first['msg']})") from None
+            raise fail("message", fields, shown(part) if part else _what(payload)) from None
         came = "no such field" if first["type"] == "missing" else shown(first["input"])
         raise fail(f"message, {part}", EXPECTED[part], came) from None
+
+
+def _what(payload: bytes) -> str:
+    """Return what came in place of a JSON object."""
+    try:
+        return f"{shown(json.loads(payload))}, which is no object"
+    except ValueError as error:
+        place = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
+        return f"{shown(payload)}, which is no JSON{place}"
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:

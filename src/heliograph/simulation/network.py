@@ -26,6 +26,7 @@ from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
+from heliograph.simulation.description.diagram import short_text_of, table_of
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import (
     Common,
@@ -52,7 +53,6 @@ class Kind(NamedTuple):
     filters: tuple[str, ...]
 
 
-@readable
 class Network(Module):
     """A plant observed by named nodes: the description that simulation, filters and reports are made from.
 
@@ -354,6 +354,11 @@ class Network(Module):
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
         one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
+
+
+readable(Network)
+Network.__repr__ = short_text_of  # type: ignore[method-assign, assignment]
+Network._repr_html_ = table_of  # type: ignore[attr-defined]
 
 
 def _world(node: Node | ReceivingNode) -> object:

@@ -117,7 +117,7 @@ class MixedCross(AbstractFilter):
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
         size = initial_size(self.base.initial_mean, self.base.initial_covariance)
-        after, innovation = corrected(prior, signal, channel, self.base.update, jnp.asarray(z), size)
+        after, innovation = corrected(prior, signal, channel, self.base.rule, jnp.asarray(z), size)
         return Propagated(*after, state.points), innovation
 
     def estimate(self, state: Propagated) -> Estimate:

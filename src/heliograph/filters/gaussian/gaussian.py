@@ -50,7 +50,7 @@ class GaussianFilter(AbstractBeliefFilter):
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
-    update: AbstractUpdate
+    rule: AbstractUpdate
     linear: bool = eqx.field(static=True)
     observed_angles: Angles = eqx.field(static=True)
 
@@ -61,7 +61,7 @@ class GaussianFilter(AbstractBeliefFilter):
         unknown = signal.about_mean() if self.linear else signal
         size = initial_size(self.initial_mean, self.initial_covariance)
         link, z = at(self.channel, k), jnp.asarray(z)
-        return corrected(state, signal, link, self.update, z, size, self.observed_angles, unknown)
+        return corrected(state, signal, link, self.rule, z, size, self.observed_angles, unknown)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
@@ -175,7 +175,7 @@ def _build(
         sensor=sensor,
         channel=described,
         transform=transform,
-        update=update.described(),
+        rule=update.described(),
         initial_mean=mean,
         initial_covariance=spread,
         linear=linear,

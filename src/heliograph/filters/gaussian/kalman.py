@@ -9,6 +9,8 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Float
 
+MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
+
 
 def kalman_filter(
     plant: AnyPlant,
@@ -35,6 +37,6 @@ def kalman_filter(
     """
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
-        raise fail("Kalman filter", "a LinearPlant and a LinearSensor", got)
+        raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
     channel = perfect(len(first(sensor).outputs))
     return gaussian_filter(plant, sensor, channel, Linearization(), None, initial_mean, initial_covariance)

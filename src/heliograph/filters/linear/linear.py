@@ -73,7 +73,7 @@ class LinearFilter(AbstractSizedFilter):
     plant: AnyPlant
     sensor: AnySensor
     channel: SecondOrder | OverTime
-    update: Polytope
+    rule: Polytope
     mean_known: bool = eqx.field(static=True)
 
     @in_float64
@@ -99,7 +99,7 @@ class LinearFilter(AbstractSizedFilter):
         y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
-        gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
+        gain, bound = self.rule.correct(state.covariance, y, channel, ~jnp.isnan(z))
         start = at(self.plant, 0)
         size = initial_size(start.initial_mean, start.initial_covariance)
         bound = above_rounding(bound, state.covariance, size)
@@ -260,7 +260,7 @@ def linear_filter(
         plant=plant,
         sensor=sensor,
         channel=described,
-        update=rule,
+        rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         claim="upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact",
         states=start.states,

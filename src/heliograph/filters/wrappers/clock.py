@@ -100,7 +100,7 @@ class ClockFilter(AbstractSizedFilter):
         arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
         observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
         # Schmidt: zero rows of the gain for offset and drift of a clock that is not observable.
-        gain, _ = base.update.correct(prior.covariance, signal, channel, present)
+        gain, _ = base.rule.correct(prior.covariance, signal, channel, present)
         gain = gain * self._estimated(observed)[:, None]
         mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
         after = _considered(prior.covariance, gain, signal, channel, total)

@@ -72,7 +72,7 @@ class FedBackFilter(AbstractSizedFilter):
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
         size = initial_size(base.initial_mean, base.initial_covariance)
-        after, innovation = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z), size)
+        after, innovation = corrected(prior, sent, at(base.channel, k), base.rule, jnp.asarray(z), size)
         return FedBackBelief(*after, state.reference), innovation
 
     @in_float64

@@ -88,7 +88,7 @@ def independent_paths(
             law of x_0 with one.
     """
     error = instance("error", Error() if error is None else error, Error, "an Error")
-    a = array("transition of paths", transition, (None, None))
+    a = array("transition of paths", transition, ("states", "states"))
     n, hops, steps = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1], error.steps
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))

@@ -1,0 +1,57 @@
+"""Public names of a package, loaded when first used; where there is none of a name, the ones most like it."""
+
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.util import find_spec
+
+import lazy_loader
+
+MOST = 3  # names that are offered
+ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing
+
+
+def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub lists its public names."""
+    load, listed, names = lazy_loader.attach_stub(package, file)
+
+    def attribute(name: str) -> object:
+        if name in names or name.startswith("_"):
+            return load(name)
+        raise AttributeError(f"{package} has no attribute {name!r}{offered(name, _public(package, names))}")
+
+    return attribute, listed, names
+
+
+def offered(name: str, known: Mapping[str, str]) -> str:
+    """Return the end of a message that offers the known names most like one that does not exist."""
+    near = closest(name, known)
+    return f"; closest: {', '.join(near)}" if near else ""
+
+
+def closest(name: str, known: Mapping[str, str]) -> list[str]:
+    """Return what stands for the known names most like a name, the nearest first; capitals and _ count for nothing."""
+    plain: dict[str, str] = {}
+    for item, shown in known.items():
+        plain.setdefault(_plain(item), shown)
+    alike = get_close_matches(_plain(name), plain, MOST, ALIKE)
+    around = [item for item in plain if len(name) > 2 and _plain(name) in item]  # kalman: kalman_filter
+    return [plain[item] for item in dict.fromkeys([*alike, *around])][:MOST]
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")
+
+
+def _public(package: str, names: list[str]) -> dict[str, str]:
+    """Return the package's names as they are written after it; of heliograph itself also those of its rooms."""
+    known = {name: name for name in names}
+    if "." not in package:
+        for room in names:
+            public = getattr(import_module(f"{package}.{room}"), "__all__", []) if _is_room(package, room) else []
+            known |= {name: f"{room}.{name}" for name in public if name not in known}
+    return known
+
+
+def _is_room(package: str, name: str) -> bool:
+    return find_spec(f"{package}.{name}") is not None

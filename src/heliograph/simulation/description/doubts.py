@@ -1,0 +1,147 @@
+"""Doubts about a network before any data: states that no sensor shows, errors without bound, memory that is ignored."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.model.fading import memory_matters
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.check import InputError
+from heliograph.numerics.types import Float
+from heliograph.simulation.boundedness import certify_boundedness
+from heliograph.simulation.description.diagram import listed, shared
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+HIDDEN = 1e-9  # of the largest singular value of the observability matrix: what is smaller is rounding
+NODES_LIMIT = 12  # nodes of which each is judged alone
+SEED = 0  # of the state at which a nonlinear plant is judged
+
+
+class Doubt(NamedTuple):
+    """A line about a network; `serious` where an estimate may not be what it is for, else something to know."""
+
+    serious: bool
+    words: str
+
+
+def doubts_before_data(network: Network) -> list[Doubt]:
+    """Return what is doubtful in a network that has not seen any data, the serious first.
+
+    Args:
+        network: the network.
+    """
+    lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network)]
+    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
+    return sorted(lines, key=lambda item: not item.serious)
+
+
+def _sensors(network: Network) -> list[AbstractSensor]:
+    """Return every sensor of the network, at its first step."""
+    sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
+    sensors += [] if network.common is None else [network.common.sensor]
+    sensors += [] if network.relays is None else [network.relays.sensor]
+    return [first(sensor) for sensor in sensors]
+
+
+def _unobservable(network: Network) -> Iterator[Doubt]:
+    """Yield the directions that no sensor shows within n steps, by the names of their states."""
+    matrix = observability(first(network.plant), _sensors(network))
+    if not np.isfinite(matrix).all():
+        yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
+        return
+    # Rows and states by their size, so that no unit matters.
+    rows = matrix / np.where(size := np.linalg.norm(matrix, axis=1, keepdims=True), size, 1.0)
+    columns = np.where(size := np.linalg.norm(rows, axis=0), size, 1.0)
+    _, singular, right = np.linalg.svd(rows / columns)
+    rank = int(np.sum(singular > HIDDEN * max(singular[0], 1e-300)))
+    hidden = np.abs(right[rank:]).max(axis=0, initial=0.0) > np.sqrt(HIDDEN)
+    names = [repr(name) for name, part in zip(network.states, hidden, strict=True) if part]
+    if names:
+        count = len(network.states) - rank
+        what = names[0] if len(names) == 1 else f"{count} of the combinations of {', '.join(names)}"
+        yield Doubt(True, f"unobservable: no sensor shows {what}, of which filters know no more than before any data")
+
+
+def observability(plant: AbstractPlant, sensors: list[AbstractSensor]) -> Float[np.ndarray, "rows n"]:
+    """Return d(y_1, ..., y_n)/dx_0 over n steps, all sensors stacked, with inputs of 1.
+
+    Linear plants and sensors have it everywhere, others at a state drawn around the initial mean, since a symmetric
+    point may hide what every other one shows.
+    """
+    # A state drawn around the initial mean, and unit inputs.
+    n = len(plant.states)
+    spread = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
+    point = np.asarray(plant.initial_mean) + spread * np.random.default_rng(SEED).normal(size=n)
+    u = jnp.ones(len(plant.inputs))
+
+    def outputs(x: jax.Array) -> jax.Array:
+        results = []
+        for _ in range(n):
+            x = plant.transition(x, u)
+            results += [sensor.measure(x) for sensor in sensors]
+        return jnp.concatenate(results)
+
+    with jax.enable_x64(True):
+        return np.asarray(jax.jacfwd(outputs)(jnp.asarray(point)))
+
+
+def _unbounded(network: Network) -> Iterator[Doubt]:
+    """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
+    # All nodes together, then each that has filters.
+    yield from _bound(network, "the mean error of every filter", True)
+    alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
+    if len(network.nodes) == 1 or not alone:
+        return
+    if len(alone) > NODES_LIMIT:
+        yield Doubt(False, f"boundedness of each node alone: not judged of {len(alone)} nodes")
+        return
+    for name in alone:
+        node = network.nodes[name]
+        yield from _bound(Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused)
+
+
+def _bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
+    try:
+        result = certify_boundedness(network)
+    except InputError as error:
+        if serious:
+            yield Doubt(False, f"boundedness: not judged ({error})")
+        return
+    if result.verdict == "impossible":
+        yield Doubt(serious, f"unbounded: {what} grows without end: {result.reason}")
+    elif result.verdict == "undecided":
+        yield Doubt(False, f"boundedness of {what}: undecided: {result.reason}")
+
+
+def _forgotten(network: Network) -> Iterator[Doubt]:
+    """Yield filters that take draws as independent over time behind a link whose gains are not."""
+    # Nodes of each filter that ignores the memory of their links.
+    nodes: dict[str, list[str]] = {}
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node):
+            continue
+        try:
+            remembers = memory_matters(node.channel)
+        except InputError:  # a memory that nothing is known of
+            continue
+        for item, filter_ in node.filters.items() if remembers else ():
+            if _forgets(filter_):
+                nodes.setdefault(item, []).append(name)
+    for item, names in nodes.items():
+        words = f"ignored memory: {item!r} of {listed(names)} takes a link for one without memory"
+        yield Doubt(True, f"{words}; linear_filter or mixture_filter of the link itself knows it")
+
+
+def _forgets(item: AbstractFilter) -> bool:
+    """Return whether a filter, or the one that it wraps, has no model of memory."""
+    inner = getattr(item, "base", item)
+    return isinstance(inner, GaussianFilter | LinearFilter)

@@ -1,0 +1,92 @@
+"""Description of a channel in words: its hops in order, what is lost and how late, and what they share."""
+
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, first
+from heliograph.numerics.traced import is_traced
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine
+from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.delay import Delayed, OfLine
+from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import Faded, Modes
+from heliograph.random_affine.noise import AbstractNoise
+
+ARROW, DIRECT = " → ", "direct"
+
+
+def link_in_words(channel: Channel) -> str:
+    """Return a channel in words, such as "Rician hop → hop of gain 1.1, 10% lost"; `direct` where z = y."""
+    if isinstance(channel, OverTime):
+        return f"varying over time, at first {link_in_words(first(channel))}"
+    if is_traced(channel):
+        return type(channel).__name__
+    return _words(channel) or DIRECT
+
+
+def _words(channel: AbstractRandomAffine) -> str:
+    """Return a map in words; nothing for one that only selects components."""
+    match channel:
+        # One case for each way of making a channel.
+        case GainAndNoise():
+            return _hop(channel)
+        case Series():
+            return ARROW.join(filter(None, map(_words, channel.maps)))
+        case Stack():
+            parts = [_words(part) or DIRECT for part in channel.maps]
+            same = len(set(parts)) == 1
+            return f"{len(parts)} × ({parts[0]})" if same else f"({' | '.join(parts)})"
+        case Erasure():
+            return f"{_words(channel.base) or DIRECT}, {_percent(1 - channel.arrival)} lost"
+        case Mixture():
+            return _mixture(channel)
+        case Delayed():
+            late = "/".join(map(str, channel.times))
+            stamped = ", timestamped" if channel.timestamped else ""
+            return f"{_words(channel.link) or DIRECT}, {late} steps late{stamped}"
+        case OfLine():
+            return _words(channel.plain)
+        case Modes():
+            alternatives = " or ".join(_words(part) or DIRECT for part in channel.maps)
+            return f"{_memory(channel)}modes ({alternatives})"
+        case Faded():
+            return f"{_memory(channel)}drifting hop"
+    return type(channel).__name__
+
+
+def _hop(hop: GainAndNoise) -> str:
+    """Return one hop in words by its law, its gain where that is one known number, and whether it adds noise."""
+    matrix, silent = np.asarray(hop.matrix), _no_noise(hop.noise)
+    if not matrix.any():
+        return "nothing sent"
+    diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
+    if not isinstance(hop.law, Constant):
+        return f"{type(hop.law).__name__} hop"
+    gain = float(hop.law.value) * matrix[0, 0] if diagonal else np.nan
+    selects = float(hop.law.value) == 1 and np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
+    if silent and (gain == 1 or selects):
+        return ""
+    kind = "known gain" if silent else "hop"
+    return f"{kind} {gain:.3g}" if diagonal and gain != 1 else kind
+
+
+def _no_noise(noise: AbstractNoise) -> bool:
+    return not np.any(np.asarray(noise.covariance)) and not np.any(np.asarray(noise.mean))
+
+
+def _mixture(channel: Mixture) -> str:
+    """Return a mixture in words; of a channel and silence, as a loss that nobody notices."""
+    shares, parts = channel.choice.probabilities, [_words(part) or DIRECT for part in channel.maps]
+    if len(parts) == 2 and parts[1] == "nothing sent":
+        return f"{parts[0]}, {_percent(shares[1])} lost unnoticed"
+    return f"({' or '.join(f'{part} ({_percent(p)})' for part, p in zip(parts, shares, strict=True))})"
+
+
+def _memory(channel: AbstractModal) -> str:
+    return "" if channel.memory.name is None else f"{channel.memory.name!r}: "
+
+
+def _percent(share: object) -> str:
+    return f"{100 * float(np.asarray(share)):.3g}%"
