@@ -9,7 +9,7 @@ import heliograph as hg
 from heliograph.simulation import best_possible, mesh_arrivals, mesh_errors
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
-from heliograph_studies.without_centre.setting import PLANT, RULES, Setting, network, positions
+from heliograph_studies.without_centre.setting import MOTION, NOISE, PLANT, RULES, Setting, network, positions
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,15 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 def centre(net: hg.Network, steps: int) -> float:
     """Trace of the error covariance of a filter that receives every measurement, after so many steps."""
     sensors = [node.sensor for node in net.nodes.values() if isinstance(node, hg.Node)]
-    information = sum(s.matrix.T @ np.linalg.solve(s.noise.covariance, s.matrix) for s in sensors)
-    a, p = np.asarray(PLANT.matrix), np.asarray(PLANT.initial_covariance)
+    information = np.zeros_like(NOISE)
+    for sensor in sensors:
+        assert isinstance(sensor, hg.LinearSensor)
+        h = np.asarray(sensor.matrix)
+        information += h.T @ np.linalg.solve(np.asarray(sensor.noise.covariance), h)
+    # Riccati recursion of a filter that receives every measurement.
+    p = np.asarray(PLANT.initial_covariance)
     for _ in range(steps):
-        p = a @ p @ a.T + PLANT.noise.covariance
+        p = MOTION @ p @ MOTION.T + NOISE
         p = np.linalg.inv(np.linalg.inv(p) + information)
     return float(np.trace(p))
 
