@@ -59,6 +59,8 @@ $(CREATED):
 .venv/.demo: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph into .venv (the first time: a minute or two, 1.4 GB) ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi,live]'
+	@$(BIN)/python -c 'import pytest' 2>/dev/null || \
+	  { printf '#!/bin/sh\necho "pytest: run make test, which installs what the tests need" >&2\nexit 2\n' >$(BIN)/pytest && chmod +x $(BIN)/pytest; }
 	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 

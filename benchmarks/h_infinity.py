@@ -21,7 +21,7 @@ def system() -> hg.h_infinity.GrowthSystem:
         hg.hop(hg.random_affine.bernoulli(p), c**2, power)
         for p, c, power in ((0.8, 0.1, 1.0), (0.75, 0.1, 1.0), (0.7, 0.15, 2.0))
     ]
-    channel = hg.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
+    channel = hg.model.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
     b = 0.15 * np.sqrt(2)
     return hg.h_infinity.growth_system(
         16, [[-0.15], [0.15]], [[0.3]], [[0.05, 0.05]], channel, 0.7, b, initial_weight=15.0

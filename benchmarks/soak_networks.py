@@ -193,7 +193,7 @@ def wired(s: Structure, units: np.ndarray, values: np.random.Generator) -> list[
 def joined(s: Structure, items: list[Any]) -> Any:
     """One channel of all outputs; where there are direct links, they are the second half."""
     whole = hg.parallel(items[: len(s.laws)])
-    return whole if s.wiring != "direct link" else hg.with_direct_link(whole, hg.parallel(items[len(s.laws) :]))
+    return whole if s.wiring != "direct link" else hg.model.with_direct_link(whole, hg.parallel(items[len(s.laws) :]))
 
 
 def lossy(s: Structure, items: list[Any], arrivals: list[float]) -> Any:

@@ -14,7 +14,7 @@ LINKS = {
     "losses": hg.erasure(hg.dropout(hg.perfect(), 0.7), 0.9),
     "drift": hg.random_affine.Faded(hg.random_affine.Autoregression(0.7, "wind"), 1.0, 0.5, [[1.0]], 0.1),
     "modes": hg.markov_fading([HOP, hg.model.silent(1, 1, 2.0)], CHAIN),
-    "atoms": hg.hop(hg.Nakagami(2.0), hg.random_affine.FiniteSupport([[-1.0], [1.0 / 3]], [0.25, 0.75])),
+    "atoms": hg.hop(hg.random_affine.Nakagami(2.0), hg.random_affine.FiniteSupport([[-1.0], [1.0 / 3]], [0.25, 0.75])),
 }
 
 

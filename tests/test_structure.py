@@ -22,6 +22,7 @@ ORDER = [
     [
         "filters.base",
         "filters.plausibility",
+        "filters.rows",
         "filters.smoother_step.base",
         "filters.smoother_step.linear",
         "filters.smoother_step.moments",

@@ -17,7 +17,7 @@ FILTERS = {
     "cubature": hg.cubature_filter,
     "extended": hg.extended_filter,
     "zero_mean": lambda *parts: hg.cubature_filter(*parts, hg.filters.ZeroMean()),
-    "mixture": hg.mixture_filter,
+    "mixture": hg.filters.mixture_filter,
     "polynomial": lambda *parts: hg.polynomial_filter(*parts, 2, degree=1),
 }
 

@@ -17,7 +17,7 @@ plant = hg.LinearPlant([[0.99]], noise=0.01, initial_mean=[3.0], initial_covaria
 sensor = hg.LinearSensor([[1.0]], noise=0.01)
 switching = hg.hop(hg.Discrete([0.5, 1.0, 1.8], [0.3, 0.4, 0.3]), noise=0.01)
 filters = {
-    "mixture": hg.mixture_filter(plant, sensor, switching),
+    "mixture": hg.filters.mixture_filter(plant, sensor, switching),
     "best linear": hg.linear_filter(plant, sensor, switching),
 }
 network = hg.Network(plant, {"node": hg.Node(sensor, switching, filters)})

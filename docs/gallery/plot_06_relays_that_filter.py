@@ -19,7 +19,7 @@ sensor = hg.LinearSensor([[1.0, 0.5]], noise=1e-3)
 
 
 def link(noise=1e-3):
-    return hg.hop(hg.LogNormal(-0.1, 0.2), noise)
+    return hg.hop(hg.random_affine.LogNormal(-0.1, 0.2), noise)
 
 
 odd = {"b": {"sensor": link(), "a": link(0.0)}, "receiver": {"a": link()}}

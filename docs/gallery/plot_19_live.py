@@ -21,7 +21,7 @@ from heliograph.serving import Fleet, InMemoryStore, Lanes, Link, Options, Servi
 turn = 0.15 * np.array([[0.0, 1.0], [-1.0, 0.0]])  # an oscillation of some forty steps
 plant = hg.LinearPlant(np.eye(2) + turn, np.diag([0.01, 0.4]), [0.0, 3.0], 0.1 * np.eye(2), states=["x", "v"])
 sensor = hg.LinearSensor([[1.0, 0.0]], 0.05, outputs=["place"])
-hop = hg.hop(hg.Rician(1.0, 0.1), noise=0.05)
+hop = hg.hop(hg.random_affine.Rician(1.0, 0.1), noise=0.05)
 network = hg.Network(plant, {"radio": hg.Node(sensor, hop, {"aware": hg.linear_filter(plant, sensor, hop)})})
 recording = hg.monte_carlo(network, 60, runs=1, key=3)
 truth = recording.truth[0, :, 0]

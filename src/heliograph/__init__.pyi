@@ -18,10 +18,7 @@ from . import (
 )
 from .random_affine.law import (
     Discrete as Discrete,
-    LogNormal as LogNormal,
-    Nakagami as Nakagami,
     Rayleigh as Rayleigh,
-    Rician as Rician,
 )
 from .random_affine.noise import (
     Gaussian as Gaussian,
@@ -38,6 +35,9 @@ from .model.sensor import (
     LinearSensor as LinearSensor,
     Sensor as Sensor,
 )
+from .model.state_space import (
+    state_space as state_space,
+)
 from .model.channel import (
     amplify_and_forward as amplify_and_forward,
     dropout as dropout,
@@ -45,12 +45,11 @@ from .model.channel import (
     hop as hop,
     parallel as parallel,
     perfect as perfect,
-    with_direct_link as with_direct_link,
 )
 from .model.fading import (
-    autoregressive_fading as autoregressive_fading,
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
+    shared as shared,
 )
 from .model.trigger import (
     Periodic as Periodic,
@@ -69,6 +68,9 @@ from .filters.gaussian.gaussian import (
 from .filters.gaussian.kalman import (
     kalman_filter as kalman_filter,
 )
+from .filters.gaussian.unscented import (
+    unscented_filter as unscented_filter,
+)
 from .filters.linear.linear import (
     linear_filter as linear_filter,
 )
@@ -81,8 +83,11 @@ from .filters.gaussian.adaptive import (
 from .filters.gaussian.robust import (
     robust_filter as robust_filter,
 )
-from .filters.modes.mixture import (
-    mixture_filter as mixture_filter,
+from .linear.steady_state import (
+    steady_state as steady_state,
+)
+from .smoothing.rts import (
+    rts_smoother as rts_smoother,
 )
 from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
@@ -97,14 +102,19 @@ from .simulation.network import (
 from .simulation.simulate import (
     monte_carlo as monte_carlo,
 )
+from .simulation.single_run import (
+    simulate as simulate,
+)
 from .simulation.recorded import (
     run as run,
 )
-from .simulation.transmission import (
-    transmit as transmit,
-)
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,
+)
+from .simulation.results.consistency import (
+    consistency as consistency,
+    nees as nees,
+    nis as nis,
 )
 from .simulation.results.record import (
     Record as Record,
@@ -117,12 +127,6 @@ from .learning.free_marks import (
 )
 from .learning.fitting import (
     fit as fit,
-)
-from .learning.identification import (
-    identifiable as identifiable,
-)
-from .learning.tell_apart import (
-    samples_to_tell as samples_to_tell,
 )
 from .live.stream import (
     Stream as Stream,

@@ -76,7 +76,7 @@ def test_no_inputs():
 def test_names_of_what_is_received():
     sensor, plant = sensed("pos", "vel"), tracked()
     assert h.Node(sensor, relayed(2), {}).received_names == ("pos", "vel")
-    both = h.with_direct_link(relayed(2), h.perfect(2))
+    both = h.model.with_direct_link(relayed(2), h.perfect(2))
     assert h.Node(sensor, both, {}).received_names == ("z0", "z1", "z2", "z3")
     net = h.Network(plant, {"a": h.Node(sensor, both, {})})
     measured = read_recording(columns(z0=TIME, z1=TIME, z2=TIME, z3=[1, 2, 3, 4]), net)

@@ -6,7 +6,7 @@ import heliograph as hg
 
 GOOD = hg.hop(hg.Discrete([0.7, 1.1], [0.4, 0.6]), hg.Gaussian([[0.2]], [0.1]))
 BAD = hg.hop(hg.Rayleigh(0.2), 0.5)
-RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
+RELAY = hg.hop(hg.random_affine.Nakagami(2.0), 0.15, amplification=1.4)
 PLANT = hg.LinearPlant([[0.98]], [[0.04]], [0.0], [[0.04 / (1 - 0.98**2)]])
 SENSOR = hg.LinearSensor([[1.0]], 0.05)
 BURSTS = np.array([[0.95, 0.05], [0.03, 0.97]])

@@ -164,7 +164,7 @@ def turning(angles: bool) -> tuple[hg.LinearPlant, hg.LinearSensor]:
 
 MAKERS = {
     "kalman": lambda p, s, c: hg.kalman_filter(p, s),
-    "mixture": hg.mixture_filter,
+    "mixture": hg.filters.mixture_filter,
 }
 
 

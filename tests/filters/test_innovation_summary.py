@@ -18,10 +18,10 @@ def drawn(rng, steps, correlation=0.0, weight=None):
 def test_the_interval_of_the_bias_covers_zero(correlation):
     """Of 400 intervals of 95 % at least 93 % cover: three standard errors of the count below; correlated ones too."""
     rng = np.random.default_rng(0)
-    found = [s for _ in range(200) for s in summarise_innovations(drawn(rng, 200, correlation))]
-    assert np.mean([s.bias_low <= 0 <= s.bias_high for s in found]) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 400)
+    summaries = [s for _ in range(200) for s in summarise_innovations(drawn(rng, 200, correlation))]
+    assert np.mean([s.bias_low <= 0 <= s.bias_high for s in summaries]) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 400)
     # The mean square of 200 values has a deviation of sqrt(2 / 200), more where they are correlated; over 400 of them.
-    assert np.mean([s.squared for s in found]) == pytest.approx(1.0, abs=0.05)
+    assert np.mean([s.squared for s in summaries]) == pytest.approx(1.0, abs=0.05)
 
 
 def test_missing_values_are_no_values_and_the_line_says_what_was_found():

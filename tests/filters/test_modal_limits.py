@@ -20,14 +20,13 @@ def test_fading_in_bursts():
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
 def test_two_sensors_in_one_shadow_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
-    chain = hg.random_affine.MarkovChain(BURSTS)
-    links = hg.parallel([bursts(chain if shared else BURSTS) for _ in range(2)])
+    links = hg.parallel([hg.shared(bursts(), "road") if shared else bursts()] * 2)
     assert variances(PLANT, two, links, STEPS)[-1, 0] == pytest.approx(limit, abs=6e-7)
 
 
 def test_two_drifting_hops():
     plant = hg.LinearPlant([[0.98, 0.1], [0, 0.95]], np.diag([0.002, 0.02]), [1.0, 0.0], np.diag([1.0, 0.2]))
-    first, second = (hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9)))
+    first, second = (hg.model.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9)))
     result = variances(plant, hg.LinearSensor([[1.0, 0.0]], 0.05), hg.amplify_and_forward([first, second]), 100)
     known = [[0.444130, 0.200298], [0.393069, 0.199766], [0.293346, 0.179459], [0.299861, 0.158136]]
     np.testing.assert_allclose(result[[0, 1, 9, 99]], known, atol=6e-7)
@@ -41,13 +40,13 @@ LIMITS = {  # a channel that remembers, and the same without memory or in other 
     "one mode": (hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]]), hg.hop(hg.Rayleigh(1.0), 0.1)),
     "equal maps": (hg.markov_fading([RELAY, RELAY], BURSTS), RELAY),
     "no correlation": (
-        hg.autoregressive_fading(1.0, 0.4, 0.0, 0.1),
+        hg.model.autoregressive_fading(1.0, 0.4, 0.0, 0.1),
         hg.hop(hg.random_affine.GivenMoments([1, 1.16]), 0.1),
     ),
     "modes in another order": (bursts(), hg.markov_fading([1.0, 0.2], np.array(BURSTS)[::-1, ::-1], 0.05)),
     "a chain with the mean, deviation and correlation of a drift": (
         bursts(),
-        hg.autoregressive_fading(0.7, 0.8 * np.sqrt(0.375 * 0.625), 0.92, 0.05),
+        hg.model.autoregressive_fading(0.7, 0.8 * np.sqrt(0.375 * 0.625), 0.92, 0.05),
     ),
 }  # fmt: skip
 
@@ -113,7 +112,7 @@ def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
 
     def likelihood(p):
         link = hg.gilbert_elliott(hg.hop(p[2], 0.05), hg.hop(0.2, 0.05), p[0], p[1])
-        channel = hg.amplify_and_forward([link, hg.autoregressive_fading(1.0, p[3], p[4], 0.05)])
+        channel = hg.amplify_and_forward([link, hg.model.autoregressive_fading(1.0, p[3], p[4], 0.05)])
         return hg.log_likelihood(hg.linear_filter(PLANT, SENSOR, channel), z)
 
     at, steps = np.array([0.05, 0.1, 1.0, 0.3, 0.8]), 1e-5 * np.eye(5)

@@ -75,7 +75,7 @@ def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed, plant, 
 @of_problems(3)
 def test_claims_hold_by_simulation(seed, plant, sensor, maps, rows, law):
     """Sum of both states' squares against the trace, within 4.5 standard errors at each of 12 steps."""
-    relay = hg.autoregressive_fading(1.0, 0.5, 0.7, 0.1)
+    relay = hg.model.autoregressive_fading(1.0, 0.5, 0.7, 0.1)
     channel = hg.amplify_and_forward([Modes(hg.random_affine.MarkovChain(rows, law), maps), relay])
     item = hg.linear_filter(plant, sensor, channel)
     record = hg.monte_carlo(hg.Network(plant, {"node": hg.Node(sensor, channel, {"f": item})}), 12, 4000, seed)

@@ -31,7 +31,7 @@ FILTERS = {
     "modal": hg.linear_filter(PUSHED, SENSOR, BURSTS),
     "cubature": hg.cubature_filter(CURVED, BEND, FADING),
     "extended": hg.extended_filter(CURVED, BEND, FADING),
-    "mixture": hg.mixture_filter(PUSHED, SENSOR, BURSTS),
+    "mixture": hg.filters.mixture_filter(PUSHED, SENSOR, BURSTS),
     "imm": hg.filters.imm_filter(PUSHED, SENSOR, BURSTS),
     "particles": hg.filters.particle_filter(PUSHED, SENSOR, BURSTS, particles=8),
     "polynomial": hg.polynomial_filter(PLANT, SENSOR, FADING, 20),

@@ -10,7 +10,7 @@ def channel(beta=paper.beta):
     """Relay path and direct path with their dropouts; the noises as unit disturbances times C."""
     noise = np.diag(paper.C) ** 2
     hops = [hg.hop(hg.random_affine.bernoulli(beta[j]), noise[j], paper.E[j]) for j in range(3)]
-    return hg.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
+    return hg.model.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
 
 
 def node(i, growth=paper.A, beta=paper.beta, steps=paper.T + 1):

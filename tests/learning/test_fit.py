@@ -157,7 +157,7 @@ def chain():
 @pytest.mark.slow
 def test_a_ridge_is_told_before_the_data():
     """The route's mean gain and its noise, gain^2 0.2 + last noise, are two of three numbers."""
-    before = hg.identifiable(chain, INPUTS)
+    before = hg.learning.identifiable(chain, INPUTS)
     assert before.ridges == 1 and before.identified == ()
     assert before.sentences == (
         "Of fading, gain and last noise only the product fading * gain and one other combination are identified; "

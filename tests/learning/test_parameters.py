@@ -24,8 +24,8 @@ def result(build):
 
 def test_where_a_number_stands_says_what_it_is():
     def build():
-        good = hg.hop(hg.Nakagami(hg.free(1.0), hg.free(1.0)), hg.free(0.1), power=hg.free(2.0))
-        bad = hg.dropout(hg.hop(hg.Rician(hg.free(1.0), hg.free(0.5)), 0.1), hg.free(0.7))
+        good = hg.hop(hg.random_affine.Nakagami(hg.free(1.0), hg.free(1.0)), hg.free(0.1), power=hg.free(2.0))
+        bad = hg.dropout(hg.hop(hg.random_affine.Rician(hg.free(1.0), hg.free(0.5)), 0.1), hg.free(0.7))
         return network(hg.gilbert_elliott(good, bad, hg.free(0.1), 0.2), hg.free(0.1), hg.free(0.2))
 
     assert result(build) == {

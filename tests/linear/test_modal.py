@@ -102,7 +102,7 @@ def test_without_modes_of_the_plant_it_is_the_linear_filter():
 
 
 def test_what_does_not_fit_is_refused():
-    drifting = hg.autoregressive_fading(0.5, 0.1, 0.9, 0.1)
+    drifting = hg.model.autoregressive_fading(0.5, 0.1, 0.9, 0.1)
     with pytest.raises(ValueError, match=r"^move: expected chains as its memories, got a gain that drifts"):
         hg.linear.modal_system(drifting, bursts(), [0.0], [[1.0]], 3)
     with pytest.raises(ValueError, match=r"^inputs of the measurement: expected 2"):

@@ -7,7 +7,10 @@ import heliograph as hg
 from tests.filters.modal_problems import BURSTS, PLANT, SENSOR, bursts, variances
 
 TWO_HOPS = hg.amplify_and_forward(
-    [hg.autoregressive_fading(1.0, 0.4, 0.95, 0.05), hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.3, 0.1), 0.1, 0.2)]
+    [
+        hg.model.autoregressive_fading(1.0, 0.4, 0.95, 0.05),
+        hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.3, 0.1), 0.1, 0.2),
+    ]
 )
 
 

@@ -151,7 +151,7 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
     """One that adds up what data say belongs together; by native code alone it is refused in one line."""
     hop = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 0.1, dimension=2)
-    item = hg.mixture_filter(PLANT, SENSOR, hop)
+    item = hg.filters.mixture_filter(PLANT, SENSOR, hop)
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     with pytest.raises(ValueError, match="native code: expected a program of operations that it takes") as caught:
         hg.Stream(item)

@@ -22,7 +22,7 @@ def forgetful() -> hg.Network:
     local = {
         "linear": hg.linear_filter(*parts),
         "cubature": hg.cubature_filter(*parts),
-        "mixture": hg.mixture_filter(*parts),
+        "mixture": hg.filters.mixture_filter(*parts),
         "open_loop": hg.filters.open_loop_filter(PUSHED),
     }
     central = hg.filters.sequential_filter([hg.cubature_filter(*parts), hg.cubature_filter(*parts)])

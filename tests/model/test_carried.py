@@ -19,7 +19,7 @@ MODES = hg.random_affine.Modes
         (hg.parallel([hg.erasure(CLEAN, 0.5), CLEAN]), (0, 1), (0, 1)),
         (hg.amplify_and_forward([CLEAN, hg.erasure(NOISY, 0.3)]), (0,), (0,)),
         (hg.hop(1.0, 0.1, power=4.0, amplification=0.5), (0,), (0,)),
-        (hg.with_direct_link(NOISY, hg.perfect()), (0,), (0, 1)),
+        (hg.model.with_direct_link(NOISY, hg.perfect()), (0,), (0, 1)),
         (hg.random_affine.Mixture([CLEAN, NOISY], [0.5, 0.5]), (0,), (0,)),
         (MODES(CHAIN, [CLEAN, hg.erasure(NOISY, 0.2)]), (0,), (0,)),
         (hg.random_affine.known([[0.0, 1.0], [2.0, 0.0]]), (1,), (0,)),
@@ -40,7 +40,7 @@ def test_gain_one_noise_and_losses_that_are_informed(channel, sent, result):
         hg.hop(-1.0, 0.1),
         hg.dropout(CLEAN, 0.9),
         hg.amplify_and_forward([hg.hop(0.5, 0.1), hg.hop(2.0 + 1e-6, 0.1)]),
-        hg.autoregressive_fading(1.0, 0.1, 0.9, 0.1),
+        hg.model.autoregressive_fading(1.0, 0.1, 0.9, 0.1),
         MODES(CHAIN, [CLEAN, HALF]),
     ],
 )

@@ -25,18 +25,18 @@ def plant_and_sensor(p):
 def chain(p):
     """Two hops: the law's parameters, the first hop's noise and power, the second's amplification."""
     first = hg.hop(hg.Rayleigh(p[0]), p[1], power=p[2])
-    return hg.amplify_and_forward([first, hg.hop(hg.Rician(p[3], p[4]), 0.1, amplification=p[5])])
+    return hg.amplify_and_forward([first, hg.hop(hg.random_affine.Rician(p[3], p[4]), 0.1, amplification=p[5])])
 
 
 def with_direct(p):
     """The chain beside a direct hop with shadowing."""
-    return hg.with_direct_link(chain(p[:6]), hg.hop(hg.LogNormal(p[6], p[7]), p[8], power=p[9]))
+    return hg.model.with_direct_link(chain(p[:6]), hg.hop(hg.random_affine.LogNormal(p[6], p[7]), p[8], power=p[9]))
 
 
 def dropout(p):
     """A hop that is lost with a probability which is a parameter too, and noise that has a mean."""
     noise = hg.Gaussian([[p[3]]], [p[4]])
-    return hg.dropout(hg.hop(hg.Nakagami(p[0], p[1]), noise, power=p[2]), p[5])
+    return hg.dropout(hg.hop(hg.random_affine.Nakagami(p[0], p[1]), noise, power=p[2]), p[5])
 
 
 def discrete(p):
@@ -48,7 +48,7 @@ def discrete(p):
 def uncertain(p):
     """Probabilities within a radius beside a known hop: the scalars of the bound are searched for at each step."""
     law = hg.Discrete([0.5, 1.0], [0.4, 0.6], 0.05)
-    return hg.with_direct_link(hg.hop(law, p[0], power=p[1]), hg.hop(1.0, p[2]))
+    return hg.model.with_direct_link(hg.hop(law, p[0], power=p[1]), hg.hop(1.0, p[2]))
 
 
 MODEL = [0.95, 0.4, 0.8, 0.2]
@@ -111,11 +111,11 @@ def concrete(channel, p):
 
 LAWS = {
     "rayleigh": (hg.Rayleigh, [0.7]),
-    "rician": (hg.Rician, [1.5, 0.4]),
-    "rician without sight": (hg.Rician, [0.0, 0.4]),
-    "rician with much sight": (hg.Rician, [30.0, 0.4]),
-    "nakagami": (hg.Nakagami, [1.7, 2.0]),
-    "log-normal": (hg.LogNormal, [-0.2, 0.3]),
+    "rician": (hg.random_affine.Rician, [1.5, 0.4]),
+    "rician without sight": (hg.random_affine.Rician, [0.0, 0.4]),
+    "rician with much sight": (hg.random_affine.Rician, [30.0, 0.4]),
+    "nakagami": (hg.random_affine.Nakagami, [1.7, 2.0]),
+    "log-normal": (hg.random_affine.LogNormal, [-0.2, 0.3]),
     "discrete": (lambda a, p: hg.Discrete([a, 1.0], [p, 1 - p]), [0.0, 0.3]),
     "bernoulli": (hg.random_affine.bernoulli, [0.8]),
     "moments": (lambda m, s: hg.random_affine.GivenMoments([m, s, 2.0, 5.0]), [1.0, 1.5]),
@@ -151,7 +151,7 @@ def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name)
 def test_rician_moments_are_those_of_the_hypergeometric_function(order, sight):
     expected = 0.3**order * 2 ** (order / 2) * special.gamma(1 + order / 2)
     expected *= special.hyp1f1(-order / 2, 1.0, -((sight / 0.3) ** 2) / 2)
-    assert hg.Rician(sight, 0.3).moment(order) == pytest.approx(expected, rel=1e-12)
+    assert hg.random_affine.Rician(sight, 0.3).moment(order) == pytest.approx(expected, rel=1e-12)
 
 
 def test_noises_and_moments_of_every_map_can_be_traced():
@@ -163,7 +163,7 @@ def test_noises_and_moments_of_every_map_can_be_traced():
             hg.random_affine.Independent([hg.Gaussian([[p[1]]]), hg.Gaussian([[0.2]], [p[2]])]),
         )
         relayed = hg.random_affine.Series(
-            [hg.hop(hg.Rayleigh(p[3]), noise), hg.hop(hg.Rician(1.0, p[4]), [[p[1], 0.0], [0.0, 0.3]])]
+            [hg.hop(hg.Rayleigh(p[3]), noise), hg.hop(hg.random_affine.Rician(1.0, p[4]), [[p[1], 0.0], [0.0, 0.3]])]
         )
         return hg.random_affine.Stack(
             [hg.dropout(relayed, p[5]), hg.erasure(hg.random_affine.known([[1.0, p[0]]], [p[2]]), 1.0).base]
@@ -188,7 +188,7 @@ def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     def make(p):
         law = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
         relayed = hg.amplify_and_forward([hg.hop(law, p[0]), hg.hop(law, 0.1, power=p[1])])
-        return relayed, hg.with_direct_link(relayed, hg.hop(hg.Rayleigh(p[2]), 0.1))
+        return relayed, hg.model.with_direct_link(relayed, hg.hop(hg.Rayleigh(p[2]), 0.1))
 
     p = np.array([0.2, 1.3, 0.9])
     with jax.enable_x64(True):

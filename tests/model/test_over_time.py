@@ -31,7 +31,9 @@ def test_objects_over_time_come_back_as_given():
     assert float(at(moved, 1).law.scale) == 1.0
 
 
-@pytest.mark.parametrize("other", [hg.hop(hg.Nakagami(1.0), 0.1), hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2)])
+@pytest.mark.parametrize(
+    "other", [hg.hop(hg.random_affine.Nakagami(1.0), 0.1), hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2)]
+)
 def test_objects_of_another_structure_or_shape_do_not_stack(other):
     with pytest.raises(ValueError, match="one structure"):
         stack([hg.hop(hg.Rayleigh(1.0), 0.1), other])

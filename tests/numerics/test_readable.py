@@ -41,7 +41,12 @@ OBJECTS = {
     "sensor": SENSOR,
     "linear plant": LINEAR,
     "linear sensor": LOOK,
-    "laws": (hg.Rician(1.0, 2.0), hg.Nakagami(1.0, 2.0), hg.LogNormal(0.0, 0.3), random_affine.Constant(2.0)),
+    "laws": (
+        hg.random_affine.Rician(1.0, 2.0),
+        hg.random_affine.Nakagami(1.0, 2.0),
+        hg.random_affine.LogNormal(0.0, 0.3),
+        random_affine.Constant(2.0),
+    ),
     "link": LINK,
     "erasure": hg.erasure(HOP, 0.9),
     "bursts": BURSTS,
@@ -109,7 +114,7 @@ def test_equality_is_of_everything():
     assert not same(np.ones((1, 2)), np.ones(2)) and not same([1], (1,)) and same({"a": 1, "b": 2}, {"b": 2, "a": 1})
     assert same(np.nan, float("nan")) and not same(1.0, 1) and not same({"a": 1}, {"b": 1})
     assert same(jax.random.key(3), jax.random.key(3)) and not same(jax.random.key(3), jax.random.key(4))
-    assert hg.Rayleigh(0.8) != hg.Rayleigh(0.9) and hg.Rayleigh(0.8) != hg.Rician(1.0, 0.8)
+    assert hg.Rayleigh(0.8) != hg.Rayleigh(0.9) and hg.Rayleigh(0.8) != hg.random_affine.Rician(1.0, 0.8)
     item, two = (simulation.Uplink(("a",), np.zeros((2, 1, 2), dtype=bool), np.full((2, 1, 2), v)) for v in (1.0, 2.0))
     assert item != two and [item] == [copy.copy(item)] and item in [two, copy.deepcopy(item)]
 

@@ -18,7 +18,7 @@ TINY = np.finfo(float).tiny
         ),
         (lambda: array("table", np.ones((2, 2, 2)), (None, 3)), "table: expected shape (any, 3), got shape (2, 2, 2)"),
         (lambda: array("list", [[1.0]], (2,)), "list: expected shape (2), got shape (1, 1)"),
-        (lambda: hg.Rician(1.0, 0.0), "Rician scale: expected a positive number, got 0"),
+        (lambda: hg.random_affine.Rician(1.0, 0.0), "Rician scale: expected a positive number, got 0"),
         (lambda: scalar("x", -1.0, 0.0), "x: expected a number of at least 0, got -1"),
         (lambda: scalar("x", 2.0, -np.inf, 1.0), "x: expected a number of at most 1, got 2"),
         (lambda: scalar("x", 2.0, 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),

@@ -52,7 +52,7 @@ def chain_of(kind):
     return {
         "dropout": [hg.dropout(first, 0.7), second],
         "modes": [hg.random_affine.Modes(chain, [first, hg.hop(0.2, 0.5)]), second],
-        "drift": [hg.autoregressive_fading(0.9, 1.0, 0.4, 0.3), second],
+        "drift": [hg.model.autoregressive_fading(0.9, 1.0, 0.4, 0.3), second],
         "delay": [hg.hop(FADING, 0.3, delay=2), second],
         "erasure": [hg.erasure(first, 0.7), second],
     }[kind]

@@ -19,20 +19,22 @@ TWO_HOPS = hg.amplify_and_forward(
         hg.hop(hg.Rayleigh(0.8), 0.1, amplification=2.0, dimension=2),
     ]
 )
-SCALAR = hg.amplify_and_forward([hg.hop(hg.Rician(1.0, 0.3), 0.2), hg.hop(hg.Discrete([0.6, 1.2], [0.4, 0.6]), 0.1)])
+SCALAR = hg.amplify_and_forward(
+    [hg.hop(hg.random_affine.Rician(1.0, 0.3), 0.2), hg.hop(hg.Discrete([0.6, 1.2], [0.4, 0.6]), 0.1)]
+)
 
 CHANNELS = {
     "known": hg.random_affine.known([[1.0, 2.0]], [0.5]),
     "discrete": GainAndNoise(hg.Discrete([0.5, 1.0], [0.3, 0.7]), [[1.0, 0.5]], 0.3),
-    "log-normal": hg.hop(hg.LogNormal(-0.1, 0.2), 0.2),
+    "log-normal": hg.hop(hg.random_affine.LogNormal(-0.1, 0.2), 0.2),
     "skewed noise": hg.hop(hg.random_affine.bernoulli(0.8), SKEWED),
     "two hops": TWO_HOPS,
     "three hops": hg.amplify_and_forward([*TWO_HOPS.maps, hg.hop(hg.random_affine.bernoulli(0.9), COVARIANCE)]),
     "dropout": hg.dropout(TWO_HOPS, 0.7),
-    "direct link": hg.with_direct_link(TWO_HOPS, hg.hop(hg.Nakagami(1.5), 0.1, dimension=2)),
+    "direct link": hg.model.with_direct_link(TWO_HOPS, hg.hop(hg.random_affine.Nakagami(1.5), 0.1, dimension=2)),
     "parallel": hg.parallel([SCALAR, hg.hop(hg.Rayleigh(1.0), 0.1)]),
     "dropout of a direct link in series": hg.random_affine.Series(
-        [hg.dropout(hg.with_direct_link(SCALAR, SCALAR), 0.6), hg.random_affine.known([[1.0, -0.5]])]
+        [hg.dropout(hg.model.with_direct_link(SCALAR, SCALAR), 0.6), hg.random_affine.known([[1.0, -0.5]])]
     ),
     "silent": hg.model.silent(2, 3, 0.5),
 }

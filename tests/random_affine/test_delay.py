@@ -16,7 +16,7 @@ delayed = hg.model.delayed
 @pytest.mark.parametrize(
     "channel",
     [
-        hg.with_direct_link(hg.hop(0.5, 0.1, delay=LAW), LINK),
+        hg.model.with_direct_link(hg.hop(0.5, 0.1, delay=LAW), LINK),
         delayed(LINK, CHAIN, timestamped=True),
     ],
     ids=["random", "chain"],
@@ -63,7 +63,7 @@ def test_delays_in_series_add_up():
 REFUSED = {
     "time stamps: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, timestamped=True)]),
     "series: expected links each delayed": lambda: hg.amplify_and_forward(
-        [LINK, hg.with_direct_link(delayed(LINK, 1), LINK)]
+        [LINK, hg.model.with_direct_link(delayed(LINK, 1), LINK)]
     ),
     "time stamps: expected those of one link": lambda: hg.amplify_and_forward(
         [delayed(LINK, LAW, timestamped=True), delayed(LINK, 1)]

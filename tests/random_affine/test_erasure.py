@@ -42,7 +42,7 @@ def test_a_relay_forwards_what_was_lost_as_lost():
 
 def test_components_are_lost_one_by_one():
     """A matrix behind them loses what it makes of lost components, and nothing else."""
-    pair = hg.with_direct_link(hg.erasure(hg.perfect(), 0.5), hg.perfect())
+    pair = hg.model.with_direct_link(hg.erasure(hg.perfect(), 0.5), hg.perfect())
     z = received(hg.random_affine.Series([pair, hg.random_affine.known([[1.0, 0.0], [0.0, 2.0], [1.0, 1.0]])]), [1.0])
     lost = np.isnan(z)
     assert np.array_equal(lost[:, 0], lost[:, 2]) and not lost[:, 1].any() and np.all(z[:, 1] == 2.0)

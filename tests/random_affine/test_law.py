@@ -11,9 +11,9 @@ from heliograph.random_affine.law import Discrete
 
 CONTINUOUS = {
     "rayleigh": (hg.Rayleigh(0.7), laws.rayleigh(scale=0.7)),
-    "rician": (hg.Rician(1.5, 0.4), laws.rice(1.5 / 0.4, scale=0.4)),
-    "nakagami": (hg.Nakagami(1.7, 2.0), laws.nakagami(1.7, scale=np.sqrt(2.0))),
-    "log-normal": (hg.LogNormal(-0.2, 0.3), laws.lognorm(0.3, scale=np.exp(-0.2))),
+    "rician": (hg.random_affine.Rician(1.5, 0.4), laws.rice(1.5 / 0.4, scale=0.4)),
+    "nakagami": (hg.random_affine.Nakagami(1.7, 2.0), laws.nakagami(1.7, scale=np.sqrt(2.0))),
+    "log-normal": (hg.random_affine.LogNormal(-0.2, 0.3), laws.lognorm(0.3, scale=np.exp(-0.2))),
 }
 
 
@@ -82,7 +82,7 @@ def test_one_uncertain_probability_alone_cannot_move():
         (lambda: Discrete([1, np.nan], [0.5, 0.5]), "finite numbers"),
         (lambda: hg.random_affine.bernoulli(1.2), "from 0 to 1, got 1.2"),
         (lambda: hg.random_affine.GivenMoments([1.0, 0.5]), "which none has"),
-        (lambda: hg.Nakagami(0.2), "Nakagami shape"),
+        (lambda: hg.random_affine.Nakagami(0.2), "Nakagami shape"),
     ],
 )
 def test_impossible_laws_are_refused(make, message):

@@ -175,7 +175,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.1)
         lambda c: hg.linear_filter(PLANT, SENSOR, c),
         lambda c: hg.cubature_filter(PLANT, SENSOR, c),
         lambda c: hg.mean_gain_filter(PLANT, SENSOR, c),
-        lambda c: hg.mixture_filter(PLANT, SENSOR, c),
+        lambda c: hg.filters.mixture_filter(PLANT, SENSOR, c),
     ],
 )
 def test_what_knows_only_independent_draws_refuses_a_memory(use, channel):

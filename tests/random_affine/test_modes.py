@@ -22,7 +22,7 @@ def link(name=None, maps=(GOOD, BAD)):
 
 
 def drift(name=None, correlation=0.8):
-    return hg.autoregressive_fading(1.0, 0.5, correlation, 0.1, name=name)
+    return hg.model.autoregressive_fading(1.0, 0.5, correlation, 0.1, name=name)
 
 
 CHANNELS = {
@@ -33,7 +33,7 @@ CHANNELS = {
     "chains of their own": hg.amplify_and_forward([link(), link()]),
     "one chain": hg.amplify_and_forward([link("road"), NOISY, link("road")]),
     "a drift": drift(),
-    "a drift and a chain": hg.with_direct_link(hg.amplify_and_forward([drift(), link()]), NOISY),
+    "a drift and a chain": hg.model.with_direct_link(hg.amplify_and_forward([drift(), link()]), NOISY),
     "one drift twice": hg.amplify_and_forward([drift("hill"), drift("hill")]),
     "loss that is not observed": hg.dropout(hg.parallel([link(), drift()]), 0.6),
 }

@@ -18,7 +18,7 @@ def relayed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", [HALF, hg.with_direct_link(HALF, hg.perfect()), relayed()])
+@pytest.mark.parametrize("channel", [HALF, hg.model.with_direct_link(HALF, hg.perfect()), relayed()])
 def test_outcomes_are_those_of_draws(channel):
     """Frequencies of each set of losses in 4,000 draws, within 4 standard errors, and the mean map of what arrived."""
     draws = np.asarray(jax.vmap(channel.sample)(jax.random.split(jax.random.key(0), 4000)))[:, :-1]

@@ -204,10 +204,10 @@ def test_links_in_one_shadow_fail_together():
 def test_modes_that_are_hidden_are_random_gains():
     """Gains of 0.2 and 1 that nobody tells; observed losses beside them help nothing; a drifting gain is as random."""
     hidden = hg.markov_fading([0.2, 1.0], [[0.95, 0.05], [0.03, 0.97]], noise=0.05)
-    for channel in (hidden, hg.erasure(hidden, 0.9), hg.autoregressive_fading(1.0, 0.3, 0.95, 0.1)):
+    for channel in (hidden, hg.erasure(hidden, 0.9), hg.model.autoregressive_fading(1.0, 0.3, 0.95, 0.1)):
         result = scalar(channel)
         assert result.verdict == "impossible" and "random gains" in result.reason
-    steady = hg.autoregressive_fading(1.0, 0.0, 0.95, 0.1)
+    steady = hg.model.autoregressive_fading(1.0, 0.0, 0.95, 0.1)
     np.testing.assert_allclose(scalar(steady).bound, scalar(hg.hop(1.0, 0.1)).bound, rtol=1e-9)
 
 

@@ -64,7 +64,7 @@ def test_a_mixtures_likelihood_is_that_of_its_sum():
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.2)
     z, variance = 1.3, 4 * 0.8 + 0.1
     parts = [p * stats.norm.pdf(z, g * 0.8, np.sqrt(g**2 * variance + 0.2)) for p, g in ((0.3, 0.5), (0.7, 1.0))]
-    likelihood = hg.log_likelihood(hg.mixture_filter(plant, sensor, channel), [z])
+    likelihood = hg.log_likelihood(hg.filters.mixture_filter(plant, sensor, channel), [z])
     assert likelihood == pytest.approx(np.log(sum(parts)), rel=1e-12)
 
 

@@ -17,7 +17,7 @@ def link(transition=BURSTS, name=None):
 
 
 RUNS, HORIZON = 64, 30
-CHAIN = hg.random_affine.MarkovChain(BURSTS)
+CHAIN = hg.random_affine.MarkovChain(BURSTS, name="valley")
 
 
 def gains(channels):
@@ -44,8 +44,8 @@ def received():
         "d": link(name="road"),
         "z": link(name="road"),
         "two hops": hg.amplify_and_forward([link(CHAIN), link(CHAIN)]),
-        "low": hg.autoregressive_fading(1.0, 0.2, 0.9, 0.0, name="hill"),
-        "high": hg.autoregressive_fading(2.0, 0.5, 0.9, 0.0, name="hill"),
+        "low": hg.model.autoregressive_fading(1.0, 0.2, 0.9, 0.0, name="hill"),
+        "high": hg.model.autoregressive_fading(2.0, 0.5, 0.9, 0.0, name="hill"),
         "in turn": in_turn("turn"),
         "in turn, unnamed": in_turn(None),
     }

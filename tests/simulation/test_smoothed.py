@@ -11,7 +11,10 @@ from heliograph.model.estimate import Estimate
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.02)
 FADING = hg.hop(hg.Discrete([0.5, 1.0, 1.4], [0.2, 0.5, 0.3]), 0.02)
-FILTERS = {"linear": hg.linear_filter(PLANT, SENSOR, FADING), "mixture": hg.mixture_filter(PLANT, SENSOR, FADING)}
+FILTERS = {
+    "linear": hg.linear_filter(PLANT, SENSOR, FADING),
+    "mixture": hg.filters.mixture_filter(PLANT, SENSOR, FADING),
+}
 GAPS = hg.Network(
     PLANT,
     {f"node {arrival}": hg.Node(SENSOR, hg.erasure(FADING, arrival), FILTERS) for arrival in (0.6, 0.9)},

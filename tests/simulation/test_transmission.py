@@ -13,7 +13,7 @@ LINK = hg.parallel([hg.amplify_and_forward([HOP, HOP]), hg.perfect()])
 
 
 def test_moments_are_the_channels():
-    z = hg.transmit(SIGNAL, LINK, seed=3)
+    z = hg.simulation.transmit(SIGNAL, LINK, seed=3)
     np.testing.assert_array_equal(z[:, 1], SIGNAL[:, 1])
     # z = g h y + noise with E[g h] = 1, Var = 1.04^2 - 1; noise 0.01 (1 + E h^2): five standard errors of the means
     rest = z[:, 0] - SIGNAL[:, 0]
@@ -24,23 +24,25 @@ def test_moments_are_the_channels():
 
 
 def test_the_seed_is_the_draw_and_tables_are_signals():
-    item = hg.transmit(SIGNAL[:50], LINK, seed=1)
-    np.testing.assert_array_equal(item, hg.transmit(pd.DataFrame(SIGNAL[:50]), LINK, seed=1))
-    assert np.any(item != hg.transmit(SIGNAL[:50], LINK, seed=2))
-    np.testing.assert_array_equal(hg.transmit(SIGNAL[:50, 0], HOP, 1), hg.transmit(SIGNAL[:50, :1], HOP, 1))
+    item = hg.simulation.transmit(SIGNAL[:50], LINK, seed=1)
+    np.testing.assert_array_equal(item, hg.simulation.transmit(pd.DataFrame(SIGNAL[:50]), LINK, seed=1))
+    assert np.any(item != hg.simulation.transmit(SIGNAL[:50], LINK, seed=2))
+    np.testing.assert_array_equal(
+        hg.simulation.transmit(SIGNAL[:50, 0], HOP, 1), hg.simulation.transmit(SIGNAL[:50, :1], HOP, 1)
+    )
 
 
 def test_what_was_not_sent_does_not_arrive_and_nothing_else_is_touched():
     holes = SIGNAL[:50].copy()
     holes[::3, 0] = np.nan
-    z, whole = hg.transmit(holes, LINK), hg.transmit(SIGNAL[:50], LINK)
+    z, whole = hg.simulation.transmit(holes, LINK), hg.simulation.transmit(SIGNAL[:50], LINK)
     np.testing.assert_array_equal(np.isnan(z), np.isnan(holes))
     np.testing.assert_array_equal(z[~np.isnan(z)], whole[~np.isnan(z)])
 
 
 def test_losses_come_in_bursts_where_the_link_remembers():
     lost = hg.erasure(hg.perfect(), 0.0)
-    z = hg.transmit(np.ones(STEPS), hg.gilbert_elliott(hg.perfect(), lost, fail=0.02, recover=0.1))[:, 0]
+    z = hg.simulation.transmit(np.ones(STEPS), hg.gilbert_elliott(hg.perfect(), lost, fail=0.02, recover=0.1))[:, 0]
     gone = np.isnan(z)
     assert abs(gone.mean() - 0.02 / 0.12) < 0.08  # 5 standard errors: variance inflated by (1 + .88) / (1 - .88)
     again = gone[1:][gone[:-1]].mean()
@@ -49,9 +51,9 @@ def test_losses_come_in_bursts_where_the_link_remembers():
 
 def test_channels_that_vary_are_read_at_the_step():
     channel = hg.model.over_time([hg.hop(float(g), 0.0) for g in range(1, 4)])
-    np.testing.assert_array_equal(hg.transmit([1.0, 1.0, 1.0], channel)[:, 0], [1, 2, 3])
+    np.testing.assert_array_equal(hg.simulation.transmit([1.0, 1.0, 1.0], channel)[:, 0], [1, 2, 3])
     with pytest.raises(ValueError, match="at most 3 steps"):
-        hg.transmit(np.ones(4), channel)
+        hg.simulation.transmit(np.ones(4), channel)
 
 
 @pytest.mark.parametrize(
@@ -66,4 +68,4 @@ def test_channels_that_vary_are_read_at_the_step():
 )
 def test_what_is_none(signal, channel, words):
     with pytest.raises(ValueError, match=words):
-        hg.transmit(signal, channel)
+        hg.simulation.transmit(signal, channel)

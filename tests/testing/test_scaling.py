@@ -51,7 +51,7 @@ def test_a_mixture():
     two = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], two)
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 0.1)
-    filters = {"mixture": hg.mixture_filter(plant, sensor, channel)}
+    filters = {"mixture": hg.filters.mixture_filter(plant, sensor, channel)}
     assert check_scaling(hg.Network(plant, {"node": hg.Node(sensor, channel, filters)})) <= 1
 
 

@@ -3,6 +3,7 @@
 import sys
 import warnings
 from importlib import import_module
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -147,7 +148,19 @@ def _written(record: "Record", out: Path | None, report: Path | None) -> list[st
         for name, estimate in estimates.items()
     ]
     places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places]
+    return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places] + _errors(record)
+
+
+def _errors(record: "Record") -> list[str]:
+    """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
+    from heliograph.report.errors import errors_of
+
+    lines = []
+    for item in errors_of(record):
+        rmse = ", ".join(f"of {state} {value:.4g}" for state, value in item.rmse.items())
+        size = "" if isnan(item.nees) else f"; NEES per state {item.nees:.3g}"
+        lines.append(f"{item.node}/{item.filter}: RMSE {rmse}{size}")
+    return lines
 
 
 def _claim(estimate: "Estimate") -> str:

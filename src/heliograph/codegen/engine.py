@@ -17,6 +17,7 @@ from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import like
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 
 Code = TypeVar("Code")
@@ -67,6 +68,21 @@ def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
+
+
+def computed(function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree]) -> PyTree:
+    """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
+
+    Args:
+        function: a function of trees of arrays.
+        by_xla: the same function compiled by XLA, which computes it elsewhere.
+        arguments: its arguments.
+    """
+    with jax.enable_x64(True):
+        choice = chosen(function, arguments, [False] * len(arguments))
+        if choice.code is None:
+            return to_numpy(by_xla(*arguments))
+        return jax.tree.map(lambda leaf: leaf[0], choice.results())
 
 
 def setting() -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.disk.output_file import check_output
 from heliograph.disk.whole_file import whole_file
@@ -20,6 +21,8 @@ from heliograph.simulation.results.record import Record
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # rows of the covariance of a pose, and of a twist
 UNKNOWN = -1.0  # first entry of a covariance that is not known, as messages of ROS have it
 ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
+
+State = TypeAliasType("State", str | None)  # of a state of the plant, if it is there
 
 
 @dataclass(frozen=True)
@@ -38,18 +41,18 @@ class Pose:
         child: name of the frame that moves.
     """
 
-    x: str | None = None
-    y: str | None = None
-    z: str | None = None
-    roll: str | None = None
-    pitch: str | None = None
-    yaw: str | None = None
-    vx: str | None = None
-    vy: str | None = None
-    vz: str | None = None
-    vroll: str | None = None
-    vpitch: str | None = None
-    vyaw: str | None = None
+    x: State = None
+    y: State = None
+    z: State = None
+    roll: State = None
+    pitch: State = None
+    yaw: State = None
+    vx: State = None
+    vy: State = None
+    vz: State = None
+    vroll: State = None
+    vpitch: State = None
+    vyaw: State = None
     frame: str = "map"
     child: str = "base_link"
 

@@ -25,12 +25,13 @@ class Recording(NamedTuple):
     """Measured data in the form of the arguments of `heliograph.run`: `run(network, *recording)`.
 
     Shapes: measurements[node] (steps, received), NaN where a component did not arrive; inputs (steps, inputs); time
-    (steps,), numbers or dates (datetime64[ns], UTC).
+    (steps,), numbers or dates (datetime64[ns], UTC); truth (steps, n), NaN where it is not known, or None.
     """
 
     measurements: dict[str, np.ndarray]
     inputs: np.ndarray
     time: np.ndarray
+    truth: np.ndarray | None = None
 
 
 def read_recording(table: object, network: Network, name: str = "recording") -> Recording:
@@ -40,7 +41,8 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
     `dt` may be left out: it is the time since the previous row in the unit of `time`, for dates in seconds, and 0 in
     the first row); each received component by `node.name` or, if the name is unique, by `name`. Components are named as
     the sensor's outputs if the channel keeps their number, else z0, z1, ... A measurement that is empty or NaN did not
-    arrive. Measurements of a relay may be left out altogether.
+    arrive. Measurements of a relay may be left out altogether. A column `truth.STATE` holds the true value of a state,
+    empty where it is not known.
 
     Args:
         table: path of the file, DataFrame, or columns by name.
@@ -58,7 +60,7 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
-    """Write a recording to a CSV or Parquet file that `read_recording` reads: time, inputs, and measurements.
+    """Write a recording to a CSV or Parquet file that `read_recording` reads: time, inputs, measurements, and truth.
 
     Args:
         recording: the measured data.
@@ -75,7 +77,15 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
     for node, names in _received_columns(network).items():
         if node in recording.measurements:
             columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
+    if recording.truth is not None:
+        columns |= dict(zip(_truth_columns(network).values(), recording.truth.T, strict=True))
     write_table(columns, path)
+
+
+def _truth_columns(network: Network) -> dict[str, str]:
+    """Return the name of the column of each state's true value, unless a node's component has it."""
+    received = {name for node in _received_columns(network).values() for names in node for name in names}
+    return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
@@ -87,7 +97,8 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
     expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
-    _refuse_unknown(columns, expected, source)
+    true = _truth_columns(network)
+    _refuse_unknown(columns, [*expected, *((name,) for name in true.values())], source)
 
     def find(names: tuple[str, ...]) -> str:
         return _find(columns, names, source)
@@ -107,7 +118,12 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     for i, name in enumerate(inputs):
         fill = name == TIME_STEP and name not in columns
         u[:, i] = seconds_between(time) if fill else _complete(columns, find((name,)), source)
-    return Recording(measurements, u, time)
+    if not any(name in columns for name in true.values()):
+        return Recording(measurements, u, time)
+    unknown = np.full(len(time), np.nan)
+    known = [true.get(state, "") for state in network.states]
+    truth = [_measured(columns, name, source) if name in columns else unknown for name in known]
+    return Recording(measurements, u, time, np.stack(truth, axis=1))
 
 
 def estimate_columns(record: Record) -> dict[str, np.ndarray]:

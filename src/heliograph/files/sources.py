@@ -57,17 +57,17 @@ SourceTable: TypeAlias = Mapping[str, Source | Sequence[Source]]
 
 
 def json_field(
-    path: str | Sequence[str],
+    path: "str | Sequence[str]",
     node: str,
-    output: str | Sequence[str] | None = None,
+    output: "str | Sequence[str] | None" = None,
     *,
-    scale: ArrayLike = 1.0,
-    offset: ArrayLike = 0.0,
+    scale: "Float[ArrayLike, '*output']" = 1.0,
+    offset: "Float[ArrayLike, '*output']" = 0.0,
     time: str | None = None,
-    time_unit: TimeUnit = "s",
+    time_unit: "TimeUnit" = "s",
     sequence: str | None = None,
     plant: str | None = None,
-) -> Source:
+) -> "Source":
     """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
 
     A network's file maps topics by a dictionary `sources`; a topic that feeds several nodes has a list of fields:

@@ -40,6 +40,9 @@ from .linear.linear import (
 from .linear.open_loop import (
     open_loop_filter as open_loop_filter,
 )
+from .modes.mixture import (
+    mixture_filter as mixture_filter,
+)
 from .modes.multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,
@@ -60,6 +63,9 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
+from .rows import (
+    Filtered as Filtered,
+)
 from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
@@ -75,6 +81,9 @@ from .gaussian.transform import (
     Cubature as Cubature,
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
+    Transformed as Transformed,
+)
+from .gaussian.unscented import (
     Unscented as Unscented,
 )
 from .gaussian.update import (

@@ -11,6 +11,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.filters.plausibility import Judgement, judge
+from heliograph.filters.rows import Filtered, filtered
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -36,8 +37,10 @@ R = TypeVar("R")
 class AbstractFilter(Module):
     """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
 
-    Deterministic: it never receives a random key. A component of z that is NaN did not arrive and is skipped. The
-    state is a pytree of arrays, so one filter object serves a stream, a recording and thousands of runs at once.
+    Deterministic: the same state and data give the same result. It receives no random key; a filter that draws holds
+    one in its state, into which it folds the data (`docs/extend.md` has one). A component of z that is NaN did not
+    arrive and is skipped. The state is a pytree of arrays, so one filter object serves a stream, a recording and
+    thousands of runs at once.
     To write one: give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and
     `estimate` under `@in_float64` where they compute anything. Data of other sizes than these fields state are refused.
 
@@ -86,6 +89,20 @@ class AbstractFilter(Module):
         """
         z, u = measured(self, z), given(self, u)
         return _step(self, state, z, u, step_number(self, k))
+
+    def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
+        """Run the filter over rows of data from its initial state: for each row predict, then correct.
+
+        Every number is used as it is; `hg.run` leaves out those that are implausible, and warns.
+
+        Args:
+            z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+            u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+
+        Raises:
+            ValueError: data of another size than the filter's, infinite values, more steps than the filter covers.
+        """
+        return filtered(self, z, u)
 
     def step_judged(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0

@@ -310,11 +310,11 @@ class Fusion(Module):
     def __init__(
         self,
         filter: str,
-        rule: AbstractFusion,
-        quantizer: Quantizer | Mapping[str, Quantizer] | None = None,
-        uplink: ReportLinks | None = None,
-        neighbours: Neighbours | None = None,
-        link: Channel | Mapping[str, Channel] | None = None,
+        rule: "AbstractFusion",
+        quantizer: "Quantizer | Mapping[str, Quantizer] | None" = None,
+        uplink: "ReportLinks | None" = None,
+        neighbours: "Neighbours | None" = None,
+        link: "Channel | Mapping[str, Channel] | None" = None,
         rounds: int = 1,
     ):
         self.filter = instance("filter of a fusion", filter, str, "its name")

@@ -38,6 +38,7 @@ from .fitting import (
 )
 from .identification import (
     Identifiability as Identifiability,
+    identifiable as identifiable,
 )
 from .recordings_apart import (
     FitEach as FitEach,
@@ -52,6 +53,9 @@ from .description import (
 )
 from .solution import (
     Row as Row,
+)
+from .tell_apart import (
+    samples_to_tell as samples_to_tell,
 )
 from .senders import (
     SenderFit as SenderFit,

@@ -23,6 +23,9 @@ from .schedule import (
     Schedule as Schedule,
     load_schedule as load_schedule,
 )
+from .steady_state import (
+    SteadyState as SteadyState,
+)
 from .system import (
     LinearSystem as LinearSystem,
     Steps as Steps,

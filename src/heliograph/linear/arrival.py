@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
+from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
@@ -92,30 +93,40 @@ def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tu
     return high, result
 
 
-def plant_matrices(plant: AnyPlant) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """A and Cov(w) of a constant linear plant.
+def plant_matrices(
+    plant: AnyPlant, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+    """A and Cov(w) of a constant linear plant, for `what` needs them.
 
     Raises:
         ValueError: another plant.
     """
-    if isinstance(plant, OverTime) or not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise):
-        raise fail("boundedness", "a LinearPlant that does not vary", _kind(plant))
-    refuse_angles("boundedness", plant)
+    if (
+        not isinstance(plant, LinearPlant)
+        or not isinstance(plant.noise, AbstractNoise)
+        or isinstance(plant.matrix, OfInputs)
+    ):
+        raise fail(what, "a LinearPlant that does not vary", _kind(plant))
+    refuse_angles(what, plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
 
 
-def sensor_matrices(sensor: AnySensor, states: int) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """C and Cov(v) of a constant linear sensor of so many states.
+def sensor_matrices(
+    sensor: AnySensor, states: int, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
+    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them.
 
     Raises:
         ValueError: another sensor.
     """
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
-        raise fail("boundedness", "a LinearSensor that does not vary", _kind(sensor))
+        raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
     check_sensor(sensor, states)
-    refuse_angles("boundedness", sensor)
+    refuse_angles(what, sensor)
     return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
 
 
 def _kind(item: AnyPlant | AnySensor) -> str:
-    return "one that varies" if isinstance(item, OverTime) else type(item).__name__
+    if isinstance(item, OverTime):
+        return "one that varies"
+    return f"one that varies with {list(item.inputs)}" if isinstance(item, LinearPlant) else type(item).__name__

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.linear.modal_lift import lifted_modes
-from heliograph.linear.moments_over_time import SteadyState, check_moments
+from heliograph.linear.moments_over_time import SteadyMoments, check_moments
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
@@ -91,7 +91,7 @@ def _lifted_steps(
     Where nothing varies and the moments of the state are steady, all later steps equal the last, to rounding.
     """
     parts, lost = [], []
-    steady = SteadyState(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
+    steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
     for k, route in enumerate(routes):
         if steady.stays(moments):

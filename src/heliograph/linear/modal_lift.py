@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heliograph.linear.moments_over_time import EPS, SteadyState, check_moments
+from heliograph.linear.moments_over_time import EPS, SteadyMoments, check_moments
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
@@ -39,7 +39,7 @@ def lifted_modes(
     of_modes = {place: item.moments(degree) for place, item in distinct.items()}
     of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
-    steady = SteadyState(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
+    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
         if steady.stays(moments) and np.array_equal(law, earlier) and k > 1:
             break

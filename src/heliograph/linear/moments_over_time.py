@@ -18,7 +18,7 @@ def check_moments(moments: Moments, k: int, order: int) -> None:
         raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
 
 
-class SteadyState:
+class SteadyMoments:
     """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
 
     What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)

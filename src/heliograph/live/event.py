@@ -10,6 +10,7 @@ from heliograph.numerics.types import ArrayLike, Float
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 WHOLE = "a whole number from 0 to 2^63 - 1"
+OF_STEPS = "any times: a plant with the input 'dt', such as LinearPlant(lambda u: F(u[0]), ..., inputs=['dt'])"
 INPUTS = "inputs"  # the node whose events are the plant's inputs
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
+from heliograph.live.event import INPUTS, OF_STEPS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
 from heliograph.live.history import READ, History, copied, read
 from heliograph.live.identity import check_same
@@ -262,7 +262,7 @@ class Timeline:
         at = moment(f"{name}, time", time)
         if self._dt is None and (at < 0 or at != int(at) or (self._horizon is not None and at >= self._horizon)):
             end = "" if self._horizon is None else f" to {self._horizon - 1}"
-            raise fail(f"{name}, time", f"a step, a whole number from 0{end}", time)
+            raise fail(f"{name}, time", f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
         came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
         return Known(place, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
 

@@ -8,6 +8,7 @@ from .channel import (
     delayed as delayed,
     mean_gain as mean_gain,
     silent as silent,
+    with_direct_link as with_direct_link,
 )
 from .clock import (
     Clock as Clock,
@@ -23,6 +24,7 @@ from .fading import (
     memory_matters as memory_matters,
     with_flag as with_flag,
     without_memory as without_memory,
+    autoregressive_fading as autoregressive_fading,
 )
 from .over_time import (
     over_time as over_time,
@@ -31,7 +33,7 @@ from .over_time import (
 from .past import (
     with_past as with_past,
 )
-from .plant import (
+from .bias import (
     with_bias as with_bias,
 )
 from .relays import (

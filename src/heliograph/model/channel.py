@@ -12,7 +12,7 @@ from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.atoms import GainAndNoise, known
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, independent
 from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
 from heliograph.random_affine.erasure import Erasure
@@ -107,7 +107,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return in_series(hops)
+    return in_series(independent(as_maps("series", hops)))
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
@@ -157,7 +157,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = as_maps("stack", [relayed, direct])
+    both = independent(as_maps("stack", [relayed, direct]))
     past = max(c.past for c in both)
     return Stack([c if c.past == past else of_part(c, sent(c), 0, past) for c in both])
 
@@ -168,7 +168,7 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    channels = as_maps("parallel channels", channels)
+    channels = independent(as_maps("parallel channels", channels))
     parts, start, total, past = [], 0, sum(sent(c) for c in channels), max(c.past for c in channels)
     for c in channels:
         parts.append(of_part(c, total, start, past))

@@ -7,11 +7,11 @@ import numpy as np
 
 from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
-from heliograph.numerics.check import array, check_count, fail, flag, scalar
+from heliograph.numerics.check import array, check_count, fail, flag, scalar, text
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories, with_memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.law import Constant
@@ -58,8 +58,8 @@ def markov_fading(
 ) -> Modes:
     """A link whose gain moves as a Markov chain: `gains` are numbers, with one `noise`, or a channel for each mode.
 
-    `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one chain, or of one `name`,
-    move together.
+    `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one `name`, or of
+    chains of one name, move together.
 
     Raises:
         ValueError: gains without a noise or channels with one, not one for each mode, rows that are no probabilities.
@@ -78,16 +78,17 @@ def markov_fading(
 
 
 def autoregressive_fading(
-    mean: ArrayLike,
-    deviation: ArrayLike,
-    correlation: ArrayLike,
+    mean: Float[ArrayLike, ""],
+    deviation: Float[ArrayLike, ""],
+    correlation: Float[ArrayLike, ""],
     noise: NoiseLike,
     dimension: int = 1,
     name: str | None = None,
 ) -> Faded:
     """A link z = g y + n whose gain drifts: Gaussian, stationary, with `correlation` from one step to the next.
 
-    `noise` is as for a hop. Links of one `name` drift together, each with its own mean and deviation.
+    `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together,
+    each with its own mean and deviation.
 
     Raises:
         ValueError: a negative deviation, a correlation outside [-1, 1], a noise that is no covariance.
@@ -133,6 +134,30 @@ def with_flag(
     nothing, values = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
     classes = Modes(memory, [GainAndNoise(Constant(1.0), nothing, FiniteSupport(values, row)) for row in rows])
     return Stack([channel, OneStepLate(classes) if late else classes])
+
+
+def shared(link: Channel, name: str) -> Channel:
+    """Return the link as one of those that share its fading: all links of one name are in one state at each step.
+
+    A link is independent of all others, also where one object stands at several nodes or hops, unless it has a name,
+    from here or as `name` of `gilbert_elliott`, `markov_fading` and the others. What the nodes of a network share
+    stands in `Network.shared` and in reports.
+
+    Args:
+        link: a link with memory, or a channel that is made of some.
+        name: name of what is shared; that of a channel with several memories is followed by their numbers.
+
+    Raises:
+        ValueError: a channel without memory (nodes share its independent draws by `Network.sharing`), no name.
+    """
+    text("name of what is shared", name)
+    as_maps("shared link", [first(link)])
+    held = memories(link)
+    if not held:
+        raise fail("shared link", "one with memory, such as gilbert_elliott(...)", "one drawn anew at each step, which "
+                   "nodes share by Network.sharing")  # fmt: skip
+    twins = {key: m.named(name if len(held) == 1 else f"{name} {i}") for i, (key, m) in enumerate(held.items())}
+    return with_memories(link, twins)
 
 
 def without_memory(channel: Channel) -> Channel:

@@ -9,18 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.of_inputs import MatrixFunction, OfInputs, matrix_of
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
-from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.noise import (
     AbstractNoise,
-    Gaussian,
-    Independent,
     Matrix,
     NoiseLike,
     Square,
@@ -151,15 +150,19 @@ class Plant(AbstractPlant):
 class LinearPlant(AbstractPlant):
     """A linear plant x+ = A x + B u + w; noise, initial law and circular states are given as for `Plant`.
 
-    Shapes: matrix (n, n), input_matrix (n, inputs).
+    A, B and the covariance of w may be functions of the input u, such as `matrix=lambda u: F(u[0])` with
+    `inputs=["dt"]`: the plant is linear all the same, varies with its inputs, and what filters claim stays exact. What
+    is computed before data (a steady state, schedules, designs) needs constants, and refuses.
+
+    Shapes: matrix (n, n), input_matrix (n, inputs), zero unless given.
 
     Raises:
         ValueError: wrong shapes, covariances that are none, numbers that are not finite, circular states that are none
-            or that a full turn changes.
+            or that a full turn changes, functions of inputs without names.
     """
 
-    matrix: Square
-    input_matrix: Matrix
+    matrix: Square  # or OfInputs, which refuses to be taken for an array
+    input_matrix: Matrix  # likewise
     noise: AbstractNoise | NoiseFunction
     initial_mean: Vector
     initial_covariance: Square
@@ -169,69 +172,55 @@ class LinearPlant(AbstractPlant):
 
     def __init__(
         self,
-        matrix: ArrayLike,
-        noise: NoiseLike,
+        matrix: "ArrayLike | MatrixFunction",
+        noise: "NoiseLike | NoiseFunction",
         initial_mean: ArrayLike,
-        initial_covariance: NoiseLike,
-        input_matrix: ArrayLike | None = None,
-        states: Sequence[str] | None = None,
-        inputs: Sequence[str] | None = None,
-        circular: Sequence[str] = (),
+        initial_covariance: "NoiseLike",
+        input_matrix: "ArrayLike | MatrixFunction | None" = None,
+        states: "Sequence[str] | None" = None,
+        inputs: "Sequence[str] | None" = None,
+        circular: "Sequence[str]" = (),
     ):
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
-        self.matrix = array("plant matrix", matrix, (n, n))
-        self.input_matrix = np.zeros((n, 0)) if input_matrix is None else array("input matrix", input_matrix, (n, None))
-        self.noise = as_noise("process noise", noise, n)
         self.states = names("state names", states, n, "x")
-        self.inputs = names("input names", inputs, self.input_matrix.shape[-1], "u")
+        # Inputs: as many as B has columns, or as have names where something depends on them.
+        varies = any(callable(item) for item in (matrix, input_matrix, noise))
+        if varies and not inputs:
+            raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
+        count = None if inputs is None or not varies else len(items("input names", inputs, "names"))
+        entry: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
+        if not callable(entry):
+            entry = array("input matrix", entry, (n, count))
+        self.inputs = names("input names", inputs, entry.shape[-1] if count is None else count, "u")
+        # A, B and Cov(w), each a constant or a function of u.
+        self.matrix = self._matrix("plant matrix", matrix, (n, n))
+        self.input_matrix = self._matrix("input matrix", entry, (n, len(self.inputs)))
+        if callable(noise):
+            check_shape("process noise covariance(u)", noise, (np.zeros(len(self.inputs)),), (n, n))
+        self.noise = noise if callable(noise) else as_noise("process noise", noise, n)
         self.circular = _circular(self.states, circular)
-        check_turns("plant", lambda x: jnp.asarray(self.matrix) @ x, self.initial_mean, self.angles, self.angles)
+        u = np.zeros(len(self.inputs))
+        check_turns("plant", lambda x: self.transition_matrix(jnp.asarray(u)) @ x, self.initial_mean, self.angles,
+                    self.angles)  # fmt: skip
+
+    def _matrix(self, name: str, value: ArrayLike | MatrixFunction, shape: tuple[int, int]) -> Any:
+        if not callable(value):
+            return array(name, value, shape)
+        check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)
+        return OfInputs(value, name, self.inputs)
+
+    def transition_matrix(self, u: jax.Array) -> jax.Array:
+        """A (n, n) under the input u (inputs,)."""
+        return matrix_of(self.matrix, u)
+
+    def shift(self, u: jax.Array) -> jax.Array:
+        """B u + E w (n,) under the input u (inputs,)."""
+        return matrix_of(self.input_matrix, u) @ u + self.noise_mean()
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """A x + B u."""
-        return jnp.asarray(self.matrix) @ x + jnp.asarray(self.input_matrix) @ u
-
-
-def with_bias(plant: LinearPlant, coupling: "Float[ArrayLike, 'n bias']", bias: LinearPlant) -> LinearPlant:
-    """Return the plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
-
-    Every filter of the result estimates both. A name that the plant has too gets the prefix "bias_".
-
-    Args:
-        plant: the plant of x (n states).
-        coupling: E (n, bias states).
-        bias: the plant of b, without inputs, independent of the first.
-
-    Raises:
-        ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
-    Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
-    """
-    for what, item in (("plant with bias", plant), ("bias", bias)):
-        instance(what, item, LinearPlant, "a LinearPlant")
-    n, extra = len(plant.states), len(bias.states)
-    coupling = array("coupling of the bias", coupling, (n, extra))
-    if bias.inputs:
-        raise fail("bias", "a plant without inputs", list(bias.inputs))
-    # (w, xi) and the two initial states are independent.
-    noises = [p.noise for p in (plant, bias) if isinstance(p.noise, AbstractNoise)]
-    if len(noises) < 2:
-        raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
-    deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
-    centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
-    xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
-    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; 0] u + [w; xi].
-    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
-    return LinearPlant(
-        xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
-        Independent(noises),
-        xp.concatenate(centers),
-        Independent(deviations),
-        xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
-        states=(*plant.states, *renamed.values()),
-        inputs=plant.inputs,
-        circular=(*plant.circular, *(renamed[name] for name in bias.circular)),
-    )
+        return self.transition_matrix(u) @ x + matrix_of(self.input_matrix, u) @ u
 
 
 def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:

@@ -22,6 +22,9 @@ from .law import (
     Constant as Constant,
     GivenMoments as GivenMoments,
     bernoulli as bernoulli,
+    LogNormal as LogNormal,
+    Nakagami as Nakagami,
+    Rician as Rician,
 )
 from .modes import (
     Faded as Faded,

@@ -301,7 +301,18 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
 def anonymous(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
     held = memories(channel)
-    return _relabelled(channel, {identity: str(i) for i, identity in enumerate(held)}) if held else channel
+    return with_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
+
+
+def independent(maps: Sequence[T]) -> list[T]:
+    """The same maps as links apart: an unnamed memory that stands in several of them becomes one of each."""
+    results, taken = [], set[str]()
+    for place, item in enumerate(maps):
+        held = memories(item)
+        again = {key: m.labelled(f"{key} of {place}") for key, m in held.items() if m.name is None and key in taken}
+        results.append(with_memories(item, again))
+        taken |= set(held)
+    return results
 
 
 def one_memory(items: Sequence[T]) -> list[T]:
@@ -310,20 +321,22 @@ def one_memory(items: Sequence[T]) -> list[T]:
     if not by_item[0] or len({len(held) for held in by_item}) > 1:
         return list(items)
     labels = [
-        {identity: label for (identity, m), label in zip(held.items(), by_item[0], strict=True) if m.name is None}
+        {key: m.labelled(label) for (key, m), label in zip(held.items(), by_item[0], strict=True) if m.name is None}
         for held in by_item
     ]
-    return [_relabelled(item, label) for item, label in zip(items, labels, strict=True)]
+    return [with_memories(item, twins) for item, twins in zip(items, labels, strict=True)]
 
 
-def _relabelled(channel: T, labels: Mapping[str, str]) -> T:
-    def relabelled(part: PyTree) -> PyTree:
-        if not _is_modal(part) or part.memory.identity not in labels:
+def with_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
+    """The map with other memories in place of those of these identities."""
+
+    def replaced(part: PyTree) -> PyTree:
+        if not _is_modal(part) or part.memory.identity not in twins:
             return part
-        return eqx.tree_at(lambda m: m.memory, part, part.memory.labelled(labels[part.memory.identity]))
+        return eqx.tree_at(lambda m: m.memory, part, twins[part.memory.identity])
 
-    relabelled_channel: T = jax.tree.map(relabelled, channel, is_leaf=_is_modal)
-    return relabelled_channel
+    result: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
+    return result
 
 
 def _is_modal(item: object) -> bool:

@@ -41,8 +41,9 @@ class Nodes(NamedTuple):
 class AbstractMemory(Module):
     """Memory of a link: a state that moves from step to step, on which the law of gain and noise depends.
 
-    Links that refer to one memory share it (shared fading). One memory is the same object, or the same `name`; the name
-    also seeds its draws, so that nodes of a network that share a memory need one.
+    Links share a memory by its `name`, which also seeds its draws (shared fading, `hg.shared`). One without a name is
+    of one link: where an object stands at several nodes or hops, each has its own. Within one map the maps that refer
+    to one object are in one state.
     """
 
     name: eqx.AbstractVar[str | None]
@@ -76,6 +77,12 @@ class AbstractMemory(Module):
         twin = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(twin, "name", None)
         object.__setattr__(twin, "identity", label)
+        return twin
+
+    def named(self, name: str) -> "AbstractMemory":
+        """Return a copy with this name, one memory with all others of the name."""
+        twin = self.labelled(_identity(name))
+        object.__setattr__(twin, "name", name)
         return twin
 
 

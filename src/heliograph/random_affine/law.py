@@ -172,7 +172,7 @@ class Rayleigh(AbstractLaw):
 
     scale: Scalar
 
-    def __init__(self, scale: ArrayLike):
+    def __init__(self, scale: "Float[ArrayLike, '']"):
         self.scale = scalar("Rayleigh scale", scale, 0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -190,7 +190,7 @@ class Rician(AbstractLaw):
     sight: Scalar
     scale: Scalar
 
-    def __init__(self, sight: ArrayLike, scale: ArrayLike):
+    def __init__(self, sight: "Float[ArrayLike, '']", scale: "Float[ArrayLike, '']"):
         self.sight = scalar("Rician line of sight", sight, 0.0)
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
@@ -230,7 +230,7 @@ class Nakagami(AbstractLaw):
     shape: Scalar
     power: Scalar
 
-    def __init__(self, shape: ArrayLike, power: ArrayLike = 1.0):
+    def __init__(self, shape: "Float[ArrayLike, '']", power: "Float[ArrayLike, '']" = 1.0):
         self.shape = scalar("Nakagami shape", shape, 0.5)
         self.power = scalar("Nakagami power", power, 0.0)
 
@@ -251,7 +251,7 @@ class LogNormal(AbstractLaw):
     log_mean: Scalar
     log_deviation: Scalar
 
-    def __init__(self, log_mean: ArrayLike, log_deviation: ArrayLike):
+    def __init__(self, log_mean: "Float[ArrayLike, '']", log_deviation: "Float[ArrayLike, '']"):
         self.log_mean = scalar("log-normal mean", log_mean)
         self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
 

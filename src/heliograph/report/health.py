@@ -57,6 +57,7 @@ class Health:
     record: Record
     links: list[Link]
     filters: list[FilterHealth]
+    shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network."""
@@ -114,7 +115,7 @@ def examine(
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test))
-    return Health(record, links, filters)
+    return Health(record, links, filters, network.shared)
 
 
 def _listening(network: Network, record: Record) -> Iterator[tuple[str, str, AbstractFilter, np.ndarray]]:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
+from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -127,11 +128,26 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         + _agreement(health, doubts),
         sections=[
             Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
-            Section("Estimates", estimates),
+            Section("Estimates", [*errors_table(record), *estimates]),
             Section("Innovations", _tests(health, drawings)),
             Section("Links", _health(health, drawings)),
         ],
     )
+
+
+def errors_table(record: Record) -> list[Table]:
+    """Return the errors of each filter where the recording has the true state."""
+    rows = [
+        [visible(f"{item.node}/{item.filter}"), item.claim, *(f"{value:.4g}" for value in item.rmse.values()),
+         "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
+        for item in errors_of(record)
+    ]  # fmt: skip
+    caption = (
+        "Root mean square error of each state against the truth in the recording. **NEES**: squared error over the "
+        "claimed one, per state: 1 where the claim holds, above 1 too sure."
+    )
+    headers = ["filter", "claim", *(visible(f"RMSE of {state}") for state in record.states), "NEES"]
+    return [Table(headers, rows, caption)] if rows else []
 
 
 def _agreement(health: Health, doubts: list[str]) -> str:
@@ -189,7 +205,7 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     return [Text([text]), Table(["filter", "claim", "size", "correlation", "p"], rows, caption), *picture]
 
 
-def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture]:
+def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     rows = []
     for link in health.links:
         mean, deviation = (f"{link.values.mean():.4g}", f"{link.values.std():.4g}") if len(link.values) else ("–", "–")
@@ -199,7 +215,16 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
     caption = "When each component arrived (blue, above) and when it did not (red, below)."
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    return [Table(headers, rows), *picture]
+    return [Table(headers, rows), *picture, *shared_text(health.shared)]
+
+
+def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+    """Return what nodes share as a sentence each; nothing where their links are independent."""
+    said = [
+        f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
+        for name, nodes in shared.items()
+    ]
+    return [Text(said)] if said else []
 
 
 def run_summary(health: Health) -> dict[str, Json]:
@@ -215,7 +240,21 @@ def run_summary(health: Health) -> dict[str, Json]:
                 "p_value": tested_filter.test.p_value,
             }
         filters.setdefault(tested_filter.node, {})[tested_filter.filter] = results
+    # Errors, where the truth is known.
+    errors: dict[str, dict[str, Json]] = {}
+    for item in errors_of(health.record):
+        size = None if np.isnan(item.nees) else item.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in item.rmse.items()}
+        errors.setdefault(item.node, {})[item.filter] = {"rmse": rmse, "nees": size}
+    # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}
-    return {"rows": len(health.record.time), "warnings": health.warnings(), "filters": filters, "links": links}
+    return {
+        "rows": len(health.record.time),
+        "warnings": health.warnings(),
+        "filters": filters,
+        "errors": errors,
+        "links": links,
+        "shared": {name: list(nodes) for name, nodes in health.shared.items()},
+    }

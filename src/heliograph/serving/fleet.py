@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
@@ -189,7 +189,7 @@ class Fleet:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         if self.lanes.dt is None and not (0 <= time <= self._end and time == int(time)):
             end = "" if self._end == np.inf else f" to {self._end:g}"
-            raise fail("message, time", f"a step, a whole number from 0{end}", time)
+            raise fail("message, time", f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
         return Known(place, sequence, time, np.array(values, dtype=np.float64), arrival)
 
     def take(self, plant: Plant, event: Known) -> Verdict:

@@ -54,8 +54,14 @@ from .results.sums import (
 from .results.statistics_by_name import (
     StatisticsByName as StatisticsByName,
 )
+from .results.consistency import (
+    Consistency as Consistency,
+)
 from .results.whiteness import (
     memory_test as memory_test,
     MemoryTest as MemoryTest,
     whitened_innovations as whitened_innovations,
+)
+from .transmission import (
+    transmit as transmit,
 )

@@ -23,7 +23,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
-from heliograph.random_affine.base import anonymous, check_forgets
+from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.flags import check_flags
@@ -289,6 +289,17 @@ class Network(Module):
         """Names of the plant's inputs."""
         names: tuple[str, ...] = first(self.plant).inputs
         return names
+
+    @property
+    def shared(self) -> dict[str, tuple[str, ...]]:
+        """Names of the nodes that share something, by its name: fading (`hg.shared`), or one channel for all."""
+        named: dict[str, list[str]] = {}
+        for name, node in self.nodes.items():
+            for memory in memories(node.channel).values() if isinstance(node, Node) else ():
+                if memory.name is not None:
+                    named.setdefault(memory.name, []).append(name)
+        results = {name: tuple(nodes) for name, nodes in named.items() if len(nodes) > 1}
+        return results if self.common is None else {"sensor and channel": self.names}
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import PyTree
 from typing_extensions import TypeAliasType
 
-from heliograph.codegen.engine import chosen
-from heliograph.numerics.check import check_times, fail, instance, table
+from heliograph.codegen.engine import computed
+from heliograph.numerics.check import array, check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
@@ -22,7 +22,7 @@ from heliograph.simulation.judging import any_implausible, doubts, plausible_ste
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
+from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -35,10 +35,11 @@ Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | Array
 def run(
     network: "Network",
     measurements: "Mapping[str, ArrayLike]",
-    inputs: Float[ArrayLike, "steps inputs"] | None = None,
-    time: Float[ArrayLike, " steps"] | None = None,
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+    time: "ArrayLike | None" = None,
+    truth: "Float[ArrayLike, 'steps n'] | None" = None,
     smooth: "AbstractSmoothing | None" = None,
-    reports: Reports | None = None,
+    reports: "Reports | None" = None,
 ) -> "Record":
     """Run every filter of the network over recorded measurements.
 
@@ -52,6 +53,8 @@ def run(
             may be left out, and with them their filters.
         inputs: (steps, inputs), the input that led to each row; by default a plant without inputs is assumed.
         time: (steps,), stored in the record; 0, 1, ... by default.
+        truth: true states (steps, n) where they are known, NaN where they are not; no filter sees them. None by
+            default.
         smooth: smoothing as in `monte_carlo`; None by default.
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
             at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
@@ -59,7 +62,7 @@ def run(
             message did not arrive. They may be left out where the links are deterministic.
 
     Returns:
-        The record, without truth.
+        The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
@@ -75,6 +78,7 @@ def run(
     z = {name: measurement_of(name, measurements[name], steps, node.received) for name, node in network.nodes.items()}
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
+    true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     # Values beyond a node's limits did not arrive.
     for name in network.names:
@@ -98,7 +102,8 @@ def run(
             name: mesh.edges.recorded(name, mesh.nodes, given.get(name), steps) for name, mesh in filters.meshes.items()
         }
         result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
-    return found_record(network, part, result, clock)
+    record = found_record(network, part, result, clock)
+    return record if true is None else with_truth(record, network.plant, true, smooth)
 
 
 def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
@@ -147,10 +152,7 @@ def _filtered(*arguments: PyTree) -> PyTree:
     filters = arguments[0]
     if filters.meshes:  # nodes by the hundred are no straight-line code
         return to_numpy(_by_xla(*arguments))
-    choice = chosen(_run_filters, arguments, [False] * len(arguments))
-    if choice.code is None:
-        return to_numpy(_by_xla(*arguments))
-    return jax.tree.map(lambda leaf: leaf[0], choice.results())
+    return computed(_run_filters, _by_xla, arguments)
 
 
 def _run_filters(

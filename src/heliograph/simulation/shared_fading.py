@@ -26,18 +26,23 @@ Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a 
 
 
 def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
-    """Places of each channel's memories among all keys: by their names, or by the first channel that has them.
+    """Places of each channel's memories among all keys: by their names, or by the channel where they have none.
 
     Raises:
         ValueError: one name for memories that differ.
     """
     held = {name: memories(channel) for name, channel in channels.items()}
     distinct(memory for item in held.values() for memory in item.values())
-    results: dict[str, int] = {}
-    for name, item in held.items():
-        for i, (identity, memory) in enumerate(item.items()):
-            results.setdefault(identity, checksum(f"memory {i} of {name}" if memory.name is None else identity))
-    return {name: np.array([results[identity] for identity in item], dtype=np.uint32) for name, item in held.items()}
+    return {
+        name: np.array(
+            [
+                checksum(f"memory {i} of {name}" if memory.name is None else identity)
+                for i, (identity, memory) in enumerate(item.items())
+            ],
+            dtype=np.uint32,
+        )
+        for name, item in held.items()
+    }
 
 
 class Late(NamedTuple):

@@ -1,6 +1,7 @@
 """Smoothed estimates of a network, from the smoother steps of its filters."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RECEIVER
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
@@ -184,6 +187,25 @@ def found_record(network: Network, part: Part | None, result: PyTree, time: np.n
     length = result["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(part.network, {"truth": None, **result["smoothed"]}, time[-length:])
     return Trajectories().others(filtered, smoothed, part.claims)
+
+
+def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
+    """Return the record of a recording with the true states, angles of estimates within half a turn of them."""
+
+    def near(item: Estimate, x: np.ndarray) -> Estimate:
+        mean = np.asarray(item.mean)
+        known = np.where(np.isnan(x), mean, x)
+        return Estimate(first(plant).near(mean, known), item.covariance, item.claim)
+
+    later = record.smoothed
+    if later is not None and smoothing is not None:
+        later = with_truth(
+            later, plant, np.broadcast_to(smoothing.about(truth), (len(later.time), truth.shape[1])), None
+        )
+    estimates = {
+        node: {name: near(item, truth) for name, item in filters.items()} for node, filters in record.estimates.items()
+    }
+    return replace(record, truth=truth, estimates=estimates, smoothed=later)
 
 
 class WithSmoothed(AbstractReducer[Result]):

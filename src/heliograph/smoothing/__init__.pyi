@@ -13,3 +13,6 @@ from .planned import (
 from .backward_pass import (
     smoother_steps as smoother_steps,
 )
+from .rts import (
+    Smoothed as Smoothed,
+)

@@ -23,6 +23,7 @@ from heliograph.filters.modes.side_information import SideInformation, SideInfor
 from heliograph.filters.modes.uncertain import UncertainModalFilter
 from heliograph.filters.wrappers.prediction import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
@@ -138,13 +139,15 @@ def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
     s, u = units.states, units.inputs
     law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
     center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
-    names = {"states": item.states, "inputs": item.inputs, "circular": item.circular}
-    if isinstance(item, LinearPlant):
-        assert isinstance(item.noise, AbstractNoise)
-        matrix, entry = s[:, None] * item.matrix / s, s[:, None] * item.input_matrix / u
-        return LinearPlant(matrix, _noise(item.noise, s), center, law, entry, **names)
     given = item.noise
     noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
+    names = {"states": item.states, "inputs": item.inputs, "circular": item.circular}
+    if isinstance(item, LinearPlant):
+        matrix, entry = (
+            InUnits(given.function, s[:, None] / by, (u,)) if isinstance(given, OfInputs) else s[:, None] * given / by
+            for given, by in ((item.matrix, s), (item.input_matrix, u))
+        )
+        return LinearPlant(matrix, noise, center, law, entry, **names)
     return Plant(InUnits(item.transition, s, (s, u)), noise, center, law, **names)
 
 

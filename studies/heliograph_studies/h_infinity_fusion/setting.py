@@ -144,7 +144,7 @@ class Setting:
     def channel(self, noises: Sequence[Noise], hop: Hop | None = None) -> hg.random_affine.AbstractRandomAffine:
         """(r, y_2): through the relay and directly, (3) to (5); links that lose unless given."""
         links = [(hop or self.lossy)(link, noise) for link, noise in enumerate(noises)]
-        return hg.with_direct_link(hg.amplify_and_forward(links[:2]), links[2])
+        return hg.model.with_direct_link(hg.amplify_and_forward(links[:2]), links[2])
 
     def disturbed_channel(self, hop: Hop | None = None) -> hg.model.OverTime:
         """With the noises C rho_s of each step, known to nobody."""

@@ -81,7 +81,7 @@ def channel(
     hop: Callable[[int], hg.random_affine.AbstractRandomAffine] = lossy,
 ) -> hg.random_affine.AbstractRandomAffine:
     """Through a relay and directly."""
-    return hg.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
+    return hg.model.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
 
 
 def system(node: str, structured: bool = True) -> hg.h_infinity.GrowthSystem:

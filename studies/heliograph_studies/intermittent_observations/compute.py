@@ -194,7 +194,7 @@ def judge(example: Example, link: AbstractRandomAffine) -> Boundedness:
 def link(setting: Setting, example: Example, channel: AbstractRandomAffine, fail: float, recover: float) -> Link:
     """Bounds, quadrature and simulation of one example over one link."""
     record = hg.monte_carlo(example.network(channel), setting.horizon, setting.runs, setting.seed)
-    arrived = ~np.isnan(record.measurements[NODE]).any(axis=2)[:, setting.begin :]
+    arrived = ~np.any(np.isnan(record.measurements[NODE][:, setting.begin :]), axis=2)
     filtered = record.estimates[NODE][FILTER].covariance[:, setting.begin :]
     known = mean_error(example, fail, recover) if example.states == 1 else float("nan")
     simulated = from_runs(example, fail, recover, np.asarray(filtered), arrived)

@@ -26,7 +26,7 @@ LOG_VARIANCE = np.log(1 + VARIANCE / MEAN**2)
 LAWS: dict[str, hg.random_affine.AbstractLaw] = {
     "rayleigh": hg.Rayleigh(MEAN / np.sqrt(np.pi / 2)),
     "two_point": hg.Discrete([MEAN - 0.4, MEAN + 0.4], [0.5, 0.5]),
-    "log_normal": hg.LogNormal(np.log(MEAN) - LOG_VARIANCE / 2, np.sqrt(LOG_VARIANCE)),
+    "log_normal": hg.random_affine.LogNormal(np.log(MEAN) - LOG_VARIANCE / 2, np.sqrt(LOG_VARIANCE)),
     "rare": hg.Discrete([MEAN - RARE * RARE_STEP, MEAN + (1 - RARE) * RARE_STEP], [1 - RARE, RARE]),
 }
 
@@ -100,7 +100,7 @@ def true_values(row: Row) -> dict[str, float]:
 def relayed(law: hg.random_affine.AbstractLaw, plant_noise: float, sensor_noise: float, hop_noise: float) -> hg.Network:
     """z1 = g y + n1 of which a part is lost and observed, z2 = y + n2 with n2 known."""
     hop = hg.erasure(hg.hop(law, hop_noise), ARRIVAL)
-    return _network(plant_noise, sensor_noise, hg.with_direct_link(hop, hg.hop(1.0, DIRECT_NOISE)))
+    return _network(plant_noise, sensor_noise, hg.model.with_direct_link(hop, hg.hop(1.0, DIRECT_NOISE)))
 
 
 def unpublished(plant_noise: float, hop_noise: float, arrival: float) -> hg.Network:

@@ -64,4 +64,4 @@ def lossy(setting: Setting) -> hg.random_affine.Modes:
 def drifting() -> hg.random_affine.AbstractRandomAffine:
     """Two hops whose gains drift."""
     first, second = ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))
-    return hg.amplify_and_forward([hg.autoregressive_fading(*hop, NOISE) for hop in (first, second)])
+    return hg.amplify_and_forward([hg.model.autoregressive_fading(*hop, NOISE) for hop in (first, second)])

@@ -15,6 +15,7 @@ from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
+from heliograph.serving.message import Message
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
@@ -42,7 +43,7 @@ class Counted:
         """As the service says."""
         return self.service.unpublished()
 
-    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+    def take(self, payloads: Sequence[bytes | Message | str]) -> list[Output]:
         """As the service does."""
         self.begun = self.begun or perf_counter()
         outputs = self.service.take(payloads)

@@ -94,7 +94,7 @@ def circuit() -> hg.model.RelayNetwork:
 
     def link(mean: float, noise: float = VARIANCE) -> hg.random_affine.GainAndNoise:
         squared = np.log(1 + SPREAD / mean**2)
-        return hg.hop(hg.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
+        return hg.hop(hg.random_affine.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
 
     odd = {"relay_2": {"sensor": link(0.92), "relay_1": link(0.9, 0.0)}, "receiver": {"relay_1": link(0.9)}}
     even = {"relay_1": {"sensor": link(0.9), "relay_2": link(0.9, 0.0)}, "receiver": {"relay_2": link(0.92)}}

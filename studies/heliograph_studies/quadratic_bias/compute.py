@@ -103,7 +103,7 @@ def design(model: Model, resolution: float) -> Designs:
     filters["memory"] = MemoryFilter(linear=linear, products=ScheduledFilter(memory), claim="exact")
     printed = printed_quadratic(*parts, model.horizon)
     filters[TRUE] = PolynomialFilter(ScheduledFilter(printed.schedule), 2)
-    filters["mixture"] = hg.mixture_filter(*parts, resolution)
+    filters["mixture"] = hg.filters.mixture_filter(*parts, resolution)
     covariance = _covariances(model, schedules | {"memory": memory}, printed)
     return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
 

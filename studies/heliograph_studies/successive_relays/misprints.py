@@ -56,7 +56,7 @@ def used_before_known(order: Sequence[tuple[str, Sequence[str]]]) -> int:
 
 
 def _alternating(
-    plant: hg.LinearPlant, sensor: hg.LinearSensor, law: hg.LogNormal, relay: float, remote: float
+    plant: hg.LinearPlant, sensor: hg.LinearSensor, law: hg.random_affine.LogNormal, relay: float, remote: float
 ) -> hg.model.RelayNetwork:
     """Two relays in turn over one law of gains, with these noises at relay and remote filter."""
     slots = [

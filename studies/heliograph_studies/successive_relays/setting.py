@@ -17,10 +17,10 @@ STATES = ("capacitor_1", "capacitor_2", "inductor")  # V, V, A
 QUIET_START = {"relay_1": (0.39, -0.21, 0.033), "relay_2": (0.84, -0.42, 0.13)}
 
 
-def shadowing(mean: float, variance: float) -> hg.LogNormal:
+def shadowing(mean: float, variance: float) -> hg.random_affine.LogNormal:
     """A log-normal gain with this mean and variance; the paper gives no law, and only two moments matter."""
     squared = np.log(1 + variance / mean**2)
-    return hg.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared))
+    return hg.random_affine.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared))
 
 
 def circuit(inductance: float, second_sign: float = -1.0) -> np.ndarray:

@@ -73,12 +73,12 @@ class Outcome:
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Read the drives; learn each rule on all drives but one, and judge it on that one."""
-    found = stages("reading the drives", partial(drives, Path(setting.recording)))
+    recorded = stages("reading the drives", partial(drives, Path(setting.recording)))
     results: dict[str, OfDrive] = {}
-    for i, drive in enumerate(found):
-        others = [other for other in found if other is not drive]
+    for i, drive in enumerate(recorded):
+        others = [other for other in recorded if other is not drive]
         work = partial(of_drive, drive, others, setting.iterations)
-        results[drive.name] = stages("drives", work, done=i, total=len(found))
+        results[drive.name] = stages("drives", work, done=i, total=len(recorded))
     mean = {rule: float(np.mean([d.rules[rule].nees for d in results.values()])) for rule in STARTS}
     return Outcome(results, mean)
 

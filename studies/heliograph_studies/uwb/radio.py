@@ -52,14 +52,14 @@ def fates(drive: Drive) -> list[np.ndarray]:
 def losses(drive: Drive) -> Loss:
     """The losses of a drive, learned from its gaps."""
     parts = fates(drive)
-    found = hg.learning.learn_losses(parts)
-    chain, single = found.laws["markov"], found.laws["independent"]
+    learned = hg.learning.learn_losses(parts)
+    chain, single = learned.laws["markov"], learned.laws["independent"]
     shares = chain.shares()
     gain = float(np.nansum(chain.log_likelihoods(parts)) - np.nansum(single.log_likelihoods(parts)))
     return Loss(
-        found.packets, found.lost / found.packets, float(shares["fail"].estimate),
+        learned.packets, learned.lost / learned.packets, float(shares["fail"].estimate),
         float(shares["recover"].estimate), gain,
-        {name: float(part.mean()) for name, part in zip(drive.names, parts, strict=True)}, found.best,
+        {name: float(part.mean()) for name, part in zip(drive.names, parts, strict=True)}, learned.best,
     )  # fmt: skip
 
 
@@ -87,8 +87,8 @@ def power(drive: Drive) -> Power:
         return hg.Network(plant, {"tag": hg.Node(sensor, hg.perfect(count), {})})
 
     rows = slice(None, None, EVERY)
-    found = hg.fit(network, rssi[rows], -10 * np.log10(distance[rows]), starts=1)
-    by_name = {item.name: item for item in found.table}
+    fitted = hg.fit(network, rssi[rows], -10 * np.log10(distance[rows]), starts=1)
+    by_name = {item.name: item for item in fitted.table}
     exponent = by_name["exponent"]
     return Power(
         by_name["level"].estimate, exponent.estimate, exponent.low, exponent.high,

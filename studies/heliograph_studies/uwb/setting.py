@@ -115,7 +115,8 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
         dt = u[0]
         block = jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         fresh = errors.deviation**2 * -jnp.expm1(-2 * dt / errors.time)  # so that the deviation stays
-        return jax.scipy.linalg.block_diag(numbers.q * jnp.kron(block, np.eye(2)), jnp.diag(fresh))
+        covariance: jax.Array = jax.scipy.linalg.block_diag(numbers.q * jnp.kron(block, np.eye(2)), jnp.diag(fresh))
+        return covariance
 
     states = ["x", "y", "vx", "vy", *(f"error{i}" for i in range(errors.ranges.shape[1]))]
     plant = hg.Plant(
@@ -129,7 +130,8 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
 
     def ranges(x: jax.Array) -> jax.Array:
         across = jnp.sqrt((x[0] - anchors[:, 0]) ** 2 + (x[1] - anchors[:, 1]) ** 2 + (HEIGHT - anchors[:, 2]) ** 2)
-        return across + numbers.excess + errors.ranges @ x[4:]
+        result: jax.Array = across + numbers.excess + errors.ranges @ x[4:]
+        return result
 
     sensor = hg.Sensor(ranges, law_of(rule, numbers, count), outputs=[f"range{i}" for i in range(count)])
     if rule == "plain":

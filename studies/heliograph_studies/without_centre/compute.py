@@ -3,13 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
 from heliograph.simulation import best_possible, mesh_arrivals, mesh_errors
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
-from heliograph_studies.without_centre.setting import MOTION, NOISE, PLANT, RULES, Setting, network, positions
+from heliograph_studies.without_centre.setting import PLANT, RULES, Setting, network, positions
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,13 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 
 def centre(net: hg.Network, steps: int) -> float:
     """Trace of the error covariance of a filter that receives every measurement, after so many steps."""
-    sensors = [node.sensor for node in net.nodes.values() if isinstance(node, hg.Node)]
-    information = np.zeros_like(NOISE)
-    for sensor in sensors:
-        assert isinstance(sensor, hg.LinearSensor)
-        h = np.asarray(sensor.matrix)
-        information += h.T @ np.linalg.solve(np.asarray(sensor.noise.covariance), h)
-    # Riccati recursion of a filter that receives every measurement.
-    p = np.asarray(PLANT.initial_covariance)
+    sensors = [n.sensor for n in net.nodes.values() if isinstance(n, hg.Node) and isinstance(n.sensor, hg.LinearSensor)]
+    rows = [(np.asarray(s.matrix), np.asarray(s.noise.covariance)) for s in sensors]
+    information = sum(h.T @ np.linalg.solve(r, h) for h, r in rows)
+    a, p = np.asarray(PLANT.matrix), np.asarray(PLANT.initial_covariance)
+    q = np.asarray(PLANT.noise_covariance(jnp.zeros(0)))
     for _ in range(steps):
-        p = MOTION @ p @ MOTION.T + NOISE
+        p = a @ p @ a.T + q
         p = np.linalg.inv(np.linalg.inv(p) + information)
     return float(np.trace(p))
 

@@ -166,7 +166,7 @@ def test_later_data_and_silence_improve_earlier_estimates():
 
 
 def test_what_does_not_fit_is_refused_in_one_line():
-    drifting = hg.autoregressive_fading(1.0, 0.1, 0.9, 0.01)
+    drifting = hg.model.autoregressive_fading(1.0, 0.1, 0.9, 0.01)
     for build, words in (
         (lambda: hg.SendOnDelta(0.0), "delta: expected a positive number"),
         (lambda: hg.SendOnDelta(-1.0), "delta: expected a positive number"),

@@ -92,7 +92,7 @@ def test_it_carries_moments_before_data_only_where_gains_are_random():
 @pytest.mark.parametrize(
     ("make", "came"),
     [
-        (lambda: hg.mixture_filter(LINE, LINEAR, SHARED_OF_TWO), "MixtureFilter"),
+        (lambda: hg.filters.mixture_filter(LINE, LINEAR, SHARED_OF_TWO), "MixtureFilter"),
         (lambda: hg.filters.gaussian_filter(CURVED, LINEAR, SHARED, QUADRATIC), "PolynomialMoments"),
     ],
 )

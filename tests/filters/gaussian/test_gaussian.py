@@ -201,7 +201,7 @@ FILTERS = {
     "zero mean": lambda c: hg.cubature_filter(LINEAR, SENSOR, c, hg.filters.ZeroMean()),
     "linear": lambda c: hg.linear_filter(LINEAR, SENSOR, c),
 }
-PARALLEL = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.Nakagami(2.0), 0.2)])
+PARALLEL = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.random_affine.Nakagami(2.0), 0.2)])
 
 
 @pytest.mark.parametrize("name", FILTERS)

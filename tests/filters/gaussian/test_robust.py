@@ -151,7 +151,9 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
         assert z.var() == pytest.approx(claimed, abs=4 * np.std((z - z.mean()) ** 2) / 447)
 
 
-@pytest.mark.parametrize("transform", [hg.filters.Cubature(), hg.filters.Linearization(), hg.filters.Unscented(1.0)])
+@pytest.mark.parametrize(
+    "transform", [hg.filters.Cubature(), hg.filters.Linearization(), hg.filters.Unscented(1.0, 0.0, 1.0)]
+)
 def test_every_transform_serves_a_nonlinear_sensor(transform):
     """Near linear (a state known to 1e-3) all agree with the linear filter to the curvature, some 1e-6."""
     plant = hg.LinearPlant(np.eye(2), np.zeros((2, 2)), [3.0, 4.0], 1e-6 * np.eye(2))

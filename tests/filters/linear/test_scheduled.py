@@ -108,7 +108,7 @@ def test_filters_keep_the_contract():
     s = model(two_sensors(), HORIZON)
     check_filter(hg.polynomial_filter(*s, HORIZON))
     check_filter(hg.filters.LinearSystemFilter(hg.linear.lifted_system(*s, 1, HORIZON)))
-    check_filter(hg.mixture_filter(*s, resolution=0.1))
+    check_filter(hg.filters.mixture_filter(*s, resolution=0.1))
 
 
 def test_horizon_beyond_the_schedule_is_refused_by_the_driver():

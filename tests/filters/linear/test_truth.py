@@ -10,7 +10,7 @@ from tests.filters.modal_problems import BURSTS, GOOD, PLANT, RELAY, SENSOR, bur
 true_error, without_memory, memory_matters = hg.filters.true_error, hg.model.without_memory, hg.model.memory_matters
 Modes = hg.random_affine.Modes
 CONVERGED = 200  # steps, after which nothing of what is looked at changes
-HOPS = [hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))]
+HOPS = [hg.model.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))]
 
 
 def memoryless(plant, sensor, channel):
@@ -34,8 +34,7 @@ def test_two_hops_that_drift():
 
 def test_a_filter_for_two_shadows_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
-    chain = hg.random_affine.MarkovChain(BURSTS)
-    apart, together = (hg.parallel([bursts(c) for c in (a, b)]) for a, b in ((BURSTS, BURSTS), (chain, chain)))
+    apart, together = (hg.parallel([link] * 2) for link in (bursts(), hg.shared(bursts(), "road")))
     result = true_error(hg.linear_filter(PLANT, two, apart), PLANT, two, together, CONVERGED)
     assert result.claimed[-1, 0, 0] == pytest.approx(0.148447, abs=6e-7)
     assert result.true[-1, 0, 0] == pytest.approx(0.238690, abs=6e-7)
@@ -58,7 +57,9 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", [bursts(), hg.amplify_and_forward(HOPS), hg.with_direct_link(bursts(), HOPS[0])])
+@pytest.mark.parametrize(
+    "channel", [bursts(), hg.amplify_and_forward(HOPS), hg.model.with_direct_link(bursts(), HOPS[0])]
+)
 def test_the_exact_filter_claims_its_truth(channel):
     result = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 60)
     np.testing.assert_allclose(result.claimed, result.true, rtol=1e-12)
@@ -102,7 +103,7 @@ def test_in_a_world_without_memory_the_claim_is_the_truth():
 def test_claims_of_filters_that_assume_no_memory():
     assert hg.cubature_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.extended_filter(PLANT, SENSOR, bursts()).claim == "nominal"
-    assert hg.mixture_filter(PLANT, SENSOR, bursts()).claim == "nominal"
+    assert hg.filters.mixture_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.mean_gain_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.cubature_filter(PLANT, SENSOR, NOISE_ONLY).claim == "exact"
     assert hg.linear_filter(PLANT, SENSOR, bursts()).claim == "exact"

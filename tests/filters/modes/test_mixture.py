@@ -14,14 +14,14 @@ TWO = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 
 
 def one_step(plant, sensor, channel, z, **options):
-    item = hg.mixture_filter(plant, sensor, channel, **options)
+    item = hg.filters.mixture_filter(plant, sensor, channel, **options)
     return item.step(item.init(), np.atleast_1d(z))[1]
 
 
 def test_gaussian_laws_give_the_linear_filter():
     plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], 0.3, [1.0, 0.0], np.eye(2))
     sensor, channel = hg.LinearSensor([[1.0, 0.5]], 0.2), hg.hop(0.8, 0.1)
-    mixed, linear = hg.mixture_filter(plant, sensor, channel), hg.linear_filter(plant, sensor, channel)
+    mixed, linear = hg.filters.mixture_filter(plant, sensor, channel), hg.linear_filter(plant, sensor, channel)
     a, b = mixed.init(), linear.init()
     for k, z in enumerate((0.3, -1.0, 2.0)):
         a, left = mixed.step(a, [z], (), k)
@@ -71,7 +71,7 @@ def test_a_missing_measurement_is_a_prediction():
 def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
     cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
-    network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.mixture_filter(*s)})})
+    network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.filters.mixture_filter(*s)})})
     result = hg.monte_carlo(network, 30, 96, 0, keep=hg.Statistics())["node"]["mixture"]
     assert result.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
 
@@ -89,13 +89,13 @@ def test_a_combination_without_randomness_is_believed_where_z_agrees_with_it_and
 def test_what_has_no_atoms_is_refused():
     plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], TWO)
     with pytest.raises(ValueError, match="gains of finitely many values, got Rayleigh"):
-        hg.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
+        hg.filters.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
     count = hg.random_affine.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
     with pytest.raises(ValueError, match="at most 4,096 combinations of atoms, got 10,000"):
-        hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, count), hg.hop(1.0, count)]))
+        hg.filters.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, count), hg.hop(1.0, count)]))
     moments = hg.random_affine.NoiseMoments([0.0, 1.0, 0.5, 2.0])
     with pytest.raises(ValueError, match="finite support or Gaussian, got NoiseMoments"):
-        hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())
+        hg.filters.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())
 
 
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
@@ -111,7 +111,7 @@ def run(item, data):
 
 def test_modes_are_weighed_with_their_atoms():
     """Two steps: the modes' probabilities after each are Bayes' rule on the filter's own Gaussian."""
-    item = hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, CHAIN))
+    item = hg.filters.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, CHAIN))
     law, state = np.array([0.75, 0.25]), item.init()
     for k, z in enumerate((0.7, -1.1)):
         moved = item.predict(state, (), k)
@@ -134,36 +134,36 @@ def test_a_chain_that_forgets_is_a_mixture():
     """Equal rows: the same numbers as one map chosen anew at each step."""
     law = [0.75, 0.25]
     data = (0.7, np.nan, -1.1, 2.0)
-    chained = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, [law, law])), data)
-    mixed = run(hg.mixture_filter(PLANT, SENSOR, hg.random_affine.Mixture(MODES, law)), data)
+    chained = run(hg.filters.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, [law, law])), data)
+    mixed = run(hg.filters.mixture_filter(PLANT, SENSOR, hg.random_affine.Mixture(MODES, law)), data)
     np.testing.assert_allclose(chained, mixed, rtol=1e-12)
 
 
 def test_one_mode_is_the_filter_without_modes():
     data = (0.7, -1.1, 2.0)
-    record = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
-    plain = run(hg.mixture_filter(PLANT, SENSOR, MODES[0]), data)
+    record = run(hg.filters.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
+    plain = run(hg.filters.mixture_filter(PLANT, SENSOR, MODES[0]), data)
     np.testing.assert_array_equal(record, plain)
 
 
 def test_with_gaussian_noise_it_is_gpb1():
     sensor, links = hg.LinearSensor([[1.0]], 0.1), hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
     data = (0.7, -1.1, 2.0, 0.1)
-    mixture = run(hg.mixture_filter(PLANT, sensor, links), data)
+    mixture = run(hg.filters.mixture_filter(PLANT, sensor, links), data)
     merged = run(hg.filters.gpb1_filter(PLANT, sensor, links), data)
     np.testing.assert_allclose(mixture, merged, rtol=1e-12)
 
 
 def test_a_drift_has_no_atoms():
     with pytest.raises(ValueError, match="gains of finitely many values, got one that drifts"):
-        hg.mixture_filter(PLANT, SENSOR, hg.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
+        hg.filters.mixture_filter(PLANT, SENSOR, hg.model.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
 
 
 @pytest.mark.parametrize("channel", [hg.dropout(hg.perfect(), 0.0), hg.model.silent(noise=0), hg.hop(0.0, 0.0)])
 def test_a_value_that_no_combination_leaves_says_nothing(channel):
     """It was NaN for ever; the likelihood is none, and the next value is used as if it had not been."""
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
-    item = hg.mixture_filter(plant, sensor, channel)
+    item = hg.filters.mixture_filter(plant, sensor, channel)
     prior = item.predict(item.init())
     after, innovation = item.correct(prior, [0.5])
     np.testing.assert_array_equal(item.estimate(after).mean, item.estimate(prior).mean)

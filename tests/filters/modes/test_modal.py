@@ -86,14 +86,14 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
         [Series([GOOD, RELAY]), Series([BAD, BAD])],
     ),
     "a direct link in the shadow of the first hop": (
-        lambda k: hg.with_direct_link(
+        lambda k: hg.model.with_direct_link(
             hg.amplify_and_forward([one_chain(k, "a"), other("b")]), Modes(chain_a(k, "a"), [BAD, GOOD])
         ),
         BOTH_LAWS, BOTH_CHAINS,
         [Stack([Series([[GOOD, BAD][i], THREE[j]]), [BAD, GOOD][i]]) for i, j in A_AND_B],
     ),
     "a loss that is not observed": (
-        lambda k: hg.dropout(hg.with_direct_link(one_chain(k), RELAY), 0.7), LAW_A, CHAIN_A,
+        lambda k: hg.dropout(hg.model.with_direct_link(one_chain(k), RELAY), 0.7), LAW_A, CHAIN_A,
         [hg.dropout(Stack([m, RELAY]), 0.7) for m in (GOOD, BAD)],
     ),
     "a choice between two shadows": (
@@ -138,7 +138,7 @@ DRIFTING = {  # gains' correlations, channel, the channel for c
     "one hop": ([0.9], lambda f: f(0), lambda g, c: g(c[0])),
     "two hops and a direct link": (
         [0.9, 0.5],
-        lambda f: hg.with_direct_link(hg.amplify_and_forward([f(0), f(1)]), RELAY),
+        lambda f: hg.model.with_direct_link(hg.amplify_and_forward([f(0), f(1)]), RELAY),
         lambda g, c: Stack([Series([g(c[0]), g(c[1])]), RELAY]),
     ),
     "three hops": (
@@ -171,7 +171,7 @@ def test_drifting_gains_need_no_grid(name):
             if total is None
             else [t + weight * p for t, p in zip(total, parts, strict=True)]
         )
-    channel = build(lambda i: hg.autoregressive_fading(1.1, 0.4, correlations[i], 0.2, name=f"drift {i}"))
+    channel = build(lambda i: hg.model.autoregressive_fading(1.1, 0.4, correlations[i], 0.2, name=f"drift {i}"))
     result = errors(hg.linear_filter(hg.model.over_time(PLANTS), hg.model.over_time(SENSORS), channel), steps)
     np.testing.assert_allclose(result, oracle.best_linear(SECOND[:steps, :steps], *total), **EXACT)
 

@@ -166,10 +166,10 @@ def test_all_claim_no_more_than_nominal(build):
 
 
 def test_a_drifting_gain_has_modes_of_its_own():
-    drift = hg.autoregressive_fading(1.0, 0.4, 0.95, 0.05)
+    drift = hg.model.autoregressive_fading(1.0, 0.4, 0.95, 0.05)
     three, five = (stepped(hg.filters.imm_filter(PLANT, SENSOR, drift, nodes=n), DATA)[0] for n in (3, 5))
     assert three.mean[0] != five.mean[0]
-    still = hg.autoregressive_fading(1.0, 0.0, 0.95, 0.05)
+    still = hg.model.autoregressive_fading(1.0, 0.0, 0.95, 0.05)
     result, _ = stepped(hg.filters.imm_filter(PLANT, SENSOR, still), DATA)
     expected, _ = stepped(hg.linear_filter(PLANT, SENSOR, hg.hop(1.0, 0.05)), DATA)
     np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-12)

@@ -84,7 +84,7 @@ def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
     np.testing.assert_allclose(result[:, 1], expected[:, 1], rtol=1e-6, atol=1e-15)  # rounding of the modes' own parts
 
 
-DRIFTS = hg.amplify_and_forward([hg.autoregressive_fading(m, 0.4, r, 0.05) for m, r in ((1.0, 0.95), (0.8, 0.9))])
+DRIFTS = hg.amplify_and_forward([hg.model.autoregressive_fading(m, 0.4, r, 0.05) for m, r in ((1.0, 0.95), (0.8, 0.9))])
 
 
 def test_a_drift_that_is_known():

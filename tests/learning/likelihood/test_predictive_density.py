@@ -29,9 +29,9 @@ class Uniform(AbstractLaw):
     ("law", "tolerance"),
     [
         (hg.Rayleigh(0.8), 1e-6),  # of the tails beyond 5.5 standard deviations of the normal score
-        (hg.LogNormal(-0.1, 0.4), 1e-5),
-        (hg.Rician(1.0, 0.3), 1e-6),
-        (hg.Nakagami(0.7, 1.3), 1e-6),
+        (hg.random_affine.LogNormal(-0.1, 0.4), 1e-5),
+        (hg.random_affine.Rician(1.0, 0.3), 1e-6),
+        (hg.random_affine.Nakagami(0.7, 1.3), 1e-6),
         (hg.Discrete([0.8, 1.2], [0.3, 0.7]), 1e-14),
         (Uniform(), 0.05),  # of 16,384 draws
     ],
@@ -141,7 +141,7 @@ def test_samples_needed_are_of_the_right_size():
     sensor = hg.Sensor(lambda x: jnp.stack([2.0 + x[0]]), 1e-9)
     local = {"open": hg.filters.open_loop_filter(still)}
     network = hg.Network(still, {"a": hg.Node(sensor, hg.hop(a, noise), local)})
-    result = hg.samples_to_tell(a, b, network)
+    result = hg.learning.samples_to_tell(a, b, network)
     z = np.linspace(-6, 12, 20001)
     p, q = (
         sum(w * norm.pdf(z, 2 * g, np.sqrt(noise)) for g, w in zip(c.values, c.probabilities, strict=True))
@@ -153,11 +153,11 @@ def test_samples_needed_are_of_the_right_size():
     np.testing.assert_allclose(result.information, means, atol=4 * max(deviations) / np.sqrt(16000))  # four errors
     expected = (norm.isf(0.05) * sum(deviations) / sum(means)) ** 2
     assert result.samples == pytest.approx(expected, rel=0.15)
-    assert hg.samples_to_tell(a, a, network).samples == np.inf
+    assert hg.learning.samples_to_tell(a, a, network).samples == np.inf
 
 
 def test_a_network_must_have_a_place_for_the_laws():
     local = {"open": hg.filters.open_loop_filter(PLANT)}
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.hop(1.0, 0.1), local)})
     with pytest.raises(ValueError, match="network: expected gains of one law, or some whose law is one of the two"):
-        hg.samples_to_tell(hg.Rayleigh(1.0), hg.LogNormal(0.0, 0.1), network)
+        hg.learning.samples_to_tell(hg.Rayleigh(1.0), hg.random_affine.LogNormal(0.0, 0.1), network)

@@ -193,8 +193,8 @@ def test_states_in_very_different_units_are_the_same_design(seed):
 
 def test_the_paths_of_a_network_have_the_powers_of_its_design():
     plant = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [0.0, 1.0], np.eye(2))
-    far = hg.hop(hg.Rician(1.0, 0.3), 0.7, power=3.0)
-    near = hg.dropout(hg.hop(hg.Nakagami(2.0, 1.3), 0.4, power=2.0), 0.8)
+    far = hg.hop(hg.random_affine.Rician(1.0, 0.3), 0.7, power=3.0)
+    near = hg.dropout(hg.hop(hg.random_affine.Nakagami(2.0, 1.3), 0.4, power=2.0), 0.8)
     nodes = {
         "far": hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.5), far, {}),
         "near": hg.Node(hg.LinearSensor([[1.0, -1.0]], 0.3), near, {}),

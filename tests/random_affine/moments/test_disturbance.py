@@ -51,7 +51,7 @@ def test_signal_columns_agree_with_the_algebra():
     relay = hg.amplify_and_forward(
         [hg.hop(hg.Rayleigh(1.0), np.diag([0.2, 0.1])), hg.hop(hg.random_affine.bernoulli(0.4), np.diag([0.3, 0.2]))]
     )
-    for item in (relay, hg.dropout(relay, 0.7), hg.with_direct_link(relay, hg.hop(1.0, np.diag([0.1, 0.4])))):
+    for item in (relay, hg.dropout(relay, 0.7), hg.model.with_direct_link(relay, hg.hop(1.0, np.diag([0.1, 0.4])))):
         result = disturbed_gain(item)
         np.testing.assert_allclose(result.mean[:, : result.inputs], item.moments(1).mean[:-1, :-1], atol=1e-14)
 

@@ -46,11 +46,11 @@ def test_worst_cases_of_a_relay_are_those_of_brute_force():
 
 
 def test_a_known_channel_has_its_own_second_moments():
-    moments = hg.random_affine.second_order(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)))
+    moments = hg.random_affine.second_order(relay(hg.Rayleigh(1.0), hg.random_affine.Nakagami(2.0)))
     assert not moments.uncertain and not np.any(moments.shift.center)
     y = np.array([0.5, -1.0])
     w = np.append(y, 1.0)
-    second = conditional_moments(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)), y, 2)
+    second = conditional_moments(relay(hg.Rayleigh(1.0), hg.random_affine.Nakagami(2.0)), y, 2)
     mean = moments.mean_gain @ y + moments.offset
     spread = evaluate(moments.spread, np.outer(w, w))
     np.testing.assert_allclose(
@@ -70,7 +70,7 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
 
     channel = hg.parallel([hg.amplify_and_forward([hg.hop(law(), 0.1), hg.hop(law(), 0.2)]) for _ in range(components)])
     if direct:
-        channel = hg.with_direct_link(channel, hg.hop(law(), 0.1, dimension=components))
+        channel = hg.model.with_direct_link(channel, hg.hop(law(), 0.1, dimension=components))
     with printing(channel=channel):
         check_that_maps_dominate(channel, rng)
 

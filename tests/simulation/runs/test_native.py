@@ -31,9 +31,9 @@ POSITION = hg.LinearSensor([[1.0, 0.5]], 0.3)
 TURNING = hg.Plant(lambda x, u: 0.8 * x + 0.3 * jnp.sin(jnp.roll(x, 1)), 0.1 * np.eye(2), np.ones(2), np.eye(2))
 BENT = hg.Sensor(lambda x: jnp.array([x[0] + 0.2 * x[1] ** 2, jnp.arctan2(x[1], 2 + x[0] ** 2)]), 0.1 * np.eye(2))
 FADINGS = {
-    "nakagami": hg.Nakagami(0.7, 1.2),
-    "rician": hg.Rician(0.9, 0.2),
-    "shadowing": hg.LogNormal(-0.1, 0.3),
+    "nakagami": hg.random_affine.Nakagami(0.7, 1.2),
+    "rician": hg.random_affine.Rician(0.9, 0.2),
+    "shadowing": hg.random_affine.LogNormal(-0.1, 0.3),
     "finite": hg.Discrete([0.5, 1.0], [0.4, 0.6]),
 }
 
@@ -62,7 +62,7 @@ def with_memory() -> hg.Network:
     chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
     fading = hg.markov_fading([0.3, 1.0], chain, noise=0.1)
     filters = {"imm": hg.filters.imm_filter(LINEAR, POSITION, fading)}
-    slow = hg.autoregressive_fading(1.0, 0.2, 0.9, 0.1)
+    slow = hg.model.autoregressive_fading(1.0, 0.2, 0.9, 0.1)
     return hg.Network(LINEAR, {"a": hg.Node(POSITION, fading, filters), "b": hg.Node(POSITION, slow, {})})
 
 

@@ -44,7 +44,7 @@ def moved(
     n = len(plant.states)
     x = Belief(mean[:n], covariance[:n, :n])
     moved = predicted(plant, transform, x, u)
-    slope = jnp.asarray(plant.matrix) if isinstance(plant, LinearPlant) else psd_solve(x.covariance, moved.cross).T
+    slope = plant.transition_matrix(u) if isinstance(plant, LinearPlant) else psd_solve(x.covariance, moved.cross).T
     cross = slope @ covariance[:n, n:]
     upper = jnp.concatenate([moved.covariance, cross], axis=1)
     lower = jnp.concatenate([cross.T, covariance[n:, n:]], axis=1)

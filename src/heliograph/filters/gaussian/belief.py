@@ -53,7 +53,7 @@ class AbstractBeliefFilter(AbstractSizedFilter):
 def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
     """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
     if isinstance(plant, LinearPlant):
-        moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
+        moved = linear_transform(plant.transition_matrix(u), plant.transition(state.mean, u), state.covariance)
     else:
         moved = transform.apply(plant.moves(u, state.mean), *state)
     return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)

@@ -167,7 +167,7 @@ class FactoredFilter(AbstractSizedFilter):
 
     def _moved(self, plant: AbstractPlant, state: Moments, u: jax.Array) -> Moments:
         if isinstance(plant, LinearPlant):
-            slopes = jnp.asarray(plant.matrix) @ state.factors.matrix()
+            slopes = plant.transition_matrix(u) @ state.factors.matrix()
             moved = Image(plant.transition(state.mean, u), slopes, [])
         else:
             moved = self._image(plant.moves(u, state.mean), state)

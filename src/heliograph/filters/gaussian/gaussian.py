@@ -71,10 +71,18 @@ class GaussianFilter(AbstractBeliefFilter):
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
             return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
-        observed_of = observed_through(channel.mean_gain, sensor.matrix)
-        process = plant.noise_covariance(jnp.asarray(u))
+        # F, Q and M H of the step.
+        u = jnp.asarray(u)
+        observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
         step = linear_smoother_step(
-            after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
+            after,
+            prior,
+            plant.transition_matrix(u),
+            process,
+            observed_of,
+            innovation.value,
+            innovation.covariance,
+            self.claim,
         )
         return replace(step, angles=plant.angles)
 

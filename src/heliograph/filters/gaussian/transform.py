@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
@@ -77,38 +77,6 @@ def _about(offsets: jax.Array, values: jax.Array, center: jax.Array) -> Transfor
     weight, spread = 1 / (2 * n), values - center[:, None]
     cross = times(weight * offsets, transpose(values[:, :n] - values[:, n:]))
     return Transformed(center, weight * times(spread, transpose(spread)), cross)
-
-
-class Unscented(AbstractTransform):
-    """Unscented transform: the mean with weight kappa / (n + kappa), and 2 n points mean +- sqrt(n + kappa) L e_j.
-
-    kappa = 0 is cubature; n + kappa = 3 matches a Gaussian's fourth moments along the axes.
-
-    Raises:
-        ValueError: (when applied) a kappa of at most -n.
-    Source: Julier and Uhlmann, A new extension of the Kalman filter to nonlinear systems (1997).
-    """
-
-    kappa: float = eqx.field(static=True)
-
-    def __init__(self, kappa: float = 1.0):
-        self.kappa = float(scalar("kappa of the unscented transform", kappa))
-
-    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Propagate the points and take their weighted moments."""
-        n = mean.shape[0]
-        total = n + self.kappa
-        if total <= 0:
-            raise fail("kappa of the unscented transform", f"more than {-n} for {n} states", f"{self.kappa:g}")
-        offsets = total**0.5 * cholesky(covariance)
-        points = jnp.concatenate([mean[:, None], mean[:, None] + offsets, mean[:, None] - offsets], axis=1)
-        values = jax.vmap(function, in_axes=1, out_axes=1)(points)
-        weights = np.concatenate([[self.kappa / total], np.full(2 * n, 0.5 / total)])
-        center = values @ weights
-        apart = values - center[:, None]
-        spread = (apart * weights) @ apart.T
-        cross = (offsets * (0.5 / total)) @ (values[:, 1 : n + 1] - values[:, n + 1 :]).T
-        return Transformed(center, (spread + spread.T) / 2, cross)
 
 
 class Linearization(AbstractTransform):

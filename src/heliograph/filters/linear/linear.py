@@ -87,8 +87,8 @@ class LinearFilter(AbstractSizedFilter):
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
-        error, state_moments = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
+        transition, shift, noise = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
+        error, state_moments = (moved(*part, transition, shift, noise) for part in (state[:2], state[2:]))
         return LinearBelief(*error, *within_range(*state_moments))
 
     @corrects
@@ -134,7 +134,7 @@ class LinearFilter(AbstractSizedFilter):
     ) -> AbstractSmootherStep:
         """Return the linear update itself, or the moments around it where E[G] is uncertain."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        transition = jnp.asarray(at(self.plant, k).matrix)
+        transition = at(self.plant, k).transition_matrix(jnp.asarray(u))
         if not self.mean_known:
             cross = before.covariance @ transition.T
             return moments_smoother_step(after, prior, cross, "nominal")

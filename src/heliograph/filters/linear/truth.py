@@ -104,14 +104,14 @@ def true_error(
 
 def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
-    n = len(plant.matrix)
+    n, given = len(plant.states), jnp.asarray(u)
     size = moments.shape[-1]
     move = np.zeros((size, size))
-    move[:n, :n], move[n, n] = plant.matrix, 1.0
-    move[:n, n] = plant.input_matrix @ u + np.asarray(plant.noise_mean())
+    move[:n, :n], move[n, n] = plant.transition_matrix(given), 1.0
+    move[:n, n] = plant.shift(given)
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = plan.transition, plan.drift
     noise = np.zeros((size, size))
-    noise[:n, :n] = plant.noise_covariance(jnp.asarray(u))
+    noise[:n, :n] = plant.noise_covariance(given)
     moved: np.ndarray = np.einsum("ij,iab->jab", rows, move @ moments @ move.T + moments[:, n, n, None, None] * noise)
     return moved
 

@@ -96,7 +96,8 @@ class MixtureFilter(AbstractSizedFilter):
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
+        transition = plant.transition_matrix(u)
+        spread = transition @ state.covariance @ transition.T + plant.noise_covariance(u)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(plant.transition(state.mean, u) + plant.noise_mean(), spread, law, jnp.asarray(True))
 
@@ -155,7 +156,7 @@ class MixtureFilter(AbstractSizedFilter):
         k: Step,
     ) -> AbstractSmootherStep:
         """Return the moments around the update."""
-        cross = before.covariance @ at(self.plant, k).matrix.T
+        cross = before.covariance @ at(self.plant, k).transition_matrix(jnp.asarray(u)).T
         return moments_smoother_step(after, prior, cross, "nominal", first(self.plant).angles)
 
 

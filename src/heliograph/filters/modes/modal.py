@@ -214,8 +214,7 @@ def linear_observation(
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
-    shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
-    move = padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+    move = padded(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
     return move, padded(plant.noise_covariance(u))
 
 

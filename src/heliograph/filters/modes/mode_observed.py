@@ -79,8 +79,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
         """Predict both pairs of moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
-        move = jnp.asarray(plant.matrix), shift, jnp.asarray(plant.noise_covariance(u))
+        move = plant.transition_matrix(u), plant.shift(u), jnp.asarray(plant.noise_covariance(u))
         return state._replace(belief=_over(state.belief, move), move=move)
 
     @corrects

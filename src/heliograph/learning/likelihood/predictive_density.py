@@ -10,6 +10,7 @@ from scipy.stats import kstest
 
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter, signal_of
 from heliograph.filters.modes.combinations import Component, atoms_of
+from heliograph.filters.rows import rows
 from heliograph.learning.likelihood.law_nodes import with_nodes
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -22,7 +23,6 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.erasure import arrived
-from heliograph.simulation.likelihood import rows
 
 NODES = 64  # values of each law: a hop's density to three digits where its noise is a tenth of its spread
 ROWS = 256  # steps whose densities are computed at once

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from heliograph.filters.rows import rows
 from heliograph.learning.likelihood.objective import Data
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.likelihood import rows
 from heliograph.simulation.network import Network
 
 FEWEST = 10  # numbers that arrived for each free one

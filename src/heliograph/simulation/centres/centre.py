@@ -148,8 +148,7 @@ class Centre(Module):
     ) -> tuple[Motion, ErrorStep, Array]:
         """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
-        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
-        motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
+        motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
         return motion, error_step(local, motion, observation), observation.noise
 

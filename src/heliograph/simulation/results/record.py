@@ -1,17 +1,19 @@
 """Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
+import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim, Estimate, is_sound
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.readable import readable
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
+from heliograph.simulation.results.consistency import nees
 from heliograph.simulation.results.frames import record_fields, record_frame
 from heliograph.simulation.results.labelled import (
     TIME,
@@ -51,7 +53,7 @@ class Record(Saved):
     Args:
         time: numbers (time,), or dates (datetime64, UTC).
         states: names of the plant's states.
-        truth: true states (run, time, n); None in a recording.
+        truth: true states (run, time, n); None in a recording without them, NaN where they are not known.
         measurements: by node, (run, time, received), NaN where nothing arrived.
         estimates: by node and filter, with mean (run, time, n), covariance (run, time, n, n) and the claim.
         uplinks: by name, of each fusion that has quantizers.
@@ -80,6 +82,30 @@ class Record(Saved):
         every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
         return len(every[0]) if every and every[0].ndim == 3 else None
 
+    def of_run(self, run: int) -> "Record":
+        """Return the record of one of the runs, without an axis of runs.
+
+        Raises:
+            ValueError: a recording, which has none, or a number that no run has.
+        """
+        if self.runs is None or check_count("run", run, 0) >= self.runs:
+            raise fail("run", "one of a Monte Carlo simulation" if self.runs is None else f"one of {self.runs}", run)
+        # All arrays but the times have an axis of runs first.
+        measurements, estimates, reports = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[run], (self.measurements, self.estimates, self.reports)
+        )
+        return replace(
+            self,
+            truth=None if self.truth is None else self.truth[run],
+            measurements=measurements,
+            estimates=estimates,
+            uplinks={
+                name: Uplink(item.nodes, item.saturated[run], item.symbols[run]) for name, item in self.uplinks.items()
+            },
+            smoothed=None if self.smoothed is None else self.smoothed.of_run(run),
+            reports=reports,
+        )
+
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
 
@@ -99,13 +125,32 @@ class Record(Saved):
             raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
 
     def rmse(self, node: str, name: str) -> dict[str, float]:
-        """Root mean square error of each state over runs and steps, in that state's unit.
+        """Root mean square error of each state over runs and the steps whose truth is known, in that state's unit.
 
         Raises:
             ValueError: a recording has no truth, or there is no such filter.
         """
         squares = self.errors(node, name).reshape(-1, len(self.states)) ** 2
-        return dict(zip(self.states, np.sqrt(squares.mean(axis=0)).tolist(), strict=True))
+        known = ~np.isnan(np.asarray(self.truth)).reshape(squares.shape)
+        sums, count = np.sum(np.where(known, squares, 0.0), axis=0), known.sum(axis=0)
+        mean = np.divide(sums, count, out=np.full(len(count), np.nan), where=count > 0)
+        return dict(zip(self.states, np.sqrt(mean).tolist(), strict=True))
+
+    def nees(self, node: str, name: str) -> np.ndarray:
+        """Normalised estimation error squared of each step (run, time), of the states whose truth is known.
+
+        Its expectation is their number where the claim is exact; NaN where no state's truth is known, or nothing is
+        claimed.
+
+        Raises:
+            ValueError: a recording has no truth, or there is no such filter.
+        """
+        errors, estimate = self.errors(node, name), self.estimates[node][name]
+        sound = is_sound(estimate)[..., None]
+        if estimate.claim == "none":
+            return np.full(errors.shape[:-1], np.nan)
+        claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
+        return nees(np.asarray(self.truth), np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.

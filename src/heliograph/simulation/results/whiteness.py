@@ -9,12 +9,13 @@ from scipy import stats
 from scipy.linalg import toeplitz
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.rows import data_of, over_rows
+from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import whiten
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.simulation.likelihood import rows
 
 
 @readable
@@ -126,9 +127,7 @@ def whitened_innovations(
     item = filter
     if item.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    z = rows("measurements", data, None, item.received, missing=True)
-    given = np.zeros((len(z), 0)) if inputs is None else inputs
-    return np.asarray(innovations_of(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False))[1])
+    return np.asarray(innovations_of(item, *data_of(item, data, inputs))[1])
 
 
 def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -160,14 +159,11 @@ def innovations_of(
     NaN where it did not arrive, or the components before it determine it.
     """
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
-        k, z_k, u_k = row
-        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+    def single(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = ~jnp.isnan(innovation.value)
         covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
         white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
-        return after, (jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan))
+        return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)
 
-    start = jax.tree.map(jnp.asarray, item.init())
-    result = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return result[0], result[1]
+    likelihoods, white = over_rows(item, z, u, single)
+    return likelihoods, white

@@ -1,0 +1,122 @@
+"""Unscented transform and the filter that it makes: sigma points of Merwe and of Julier."""
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter
+from heliograph.filters.gaussian.transform import AbstractTransform, Function, Transformed
+from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import ArrayLike, Float, Scalar
+
+ROUNDING = 1e-12  # relative, of a condition on parameters that holds with equality
+
+
+class Unscented(AbstractTransform):
+    """Scaled unscented transform: the mean m and 2 n points m +- sqrt(c) L e_j, with c = alpha^2 (n + kappa).
+
+    With e_i = f(x_i) - f(m), each point weighted by 1 / (2 c), the weights sum to one and the sample moments are
+
+        mean = f(m) + d,  covariance = sum_i e_i e_i' / (2 c) + (beta - alpha^2) d d',  d = sum_i e_i / (2 c),
+
+    which loses no digits where alpha is small and the weight of m is large and negative. Merwe's points are these;
+    Julier's are those with alpha = 1 and beta = 0, and `Cubature` has kappa = 0 besides. The covariance is positive
+    semidefinite for every f where alpha^2 kappa + beta n >= 0 (by Cauchy and Schwarz, d d' is at most n / c times the
+    sum), and indefinite for some f elsewhere.
+
+    Args:
+        alpha: spread of the points, above 0.
+        beta: weight of the mean's curvature, 2 for a Gaussian state.
+        kappa: second spread, above -n.
+
+    Raises:
+        ValueError: an alpha that is not positive, or (when applied) points without a spread or an indefinite
+            covariance.
+
+    Source: Wan and van der Merwe, The unscented Kalman filter (2001), equation (7.30); Julier and Uhlmann, Unscented
+        filtering and nonlinear estimation (2004).
+    """
+
+    alpha: Scalar
+    beta: Scalar
+    kappa: Scalar
+
+    def __init__(self, alpha: Scalar = 1e-3, beta: Scalar = 2.0, kappa: Scalar = 0.0):
+        self.alpha, self.beta = scalar("alpha", alpha), scalar("beta", beta)
+        self.kappa = scalar("kappa", kappa)
+        if not is_traced(self.alpha) and self.alpha <= 0:
+            raise fail("alpha", "a positive number", alpha)
+
+    def check(self, n: int) -> None:
+        """Raise ValueError where there are no such points of n states, or their covariance may be indefinite."""
+        if is_traced(self.alpha, self.beta, self.kappa):
+            return
+        alpha, beta, kappa = float(self.alpha), float(self.beta), float(self.kappa)
+        if n + kappa <= 0:
+            raise fail("kappa", f"more than {-n} for {n} states", kappa)
+        size = alpha**2 * abs(kappa) + abs(beta) * n
+        if alpha**2 * kappa + beta * n < -ROUNDING * size:
+            least = 0.0 - beta * n / alpha**2
+            raise fail("kappa", f"at least {least:g} for {n} states, so that no covariance is indefinite", kappa)
+
+    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
+        """Propagate the points and take their weighted moments."""
+        n = mean.shape[0]
+        self.check(n)
+        scale = jnp.asarray(self.alpha) ** 2 * (n + jnp.asarray(self.kappa))
+        # Points m + sqrt(c) L e_j and m - sqrt(c) L e_j, as rows, and f at them and at m.
+        offsets = jnp.sqrt(scale) * cholesky(covariance).T
+        values = jax.vmap(function)(jnp.concatenate([mean[None], mean + offsets, mean - offsets]))
+        # Moments about f(m).
+        change = values[1:] - values[0]
+        shift = jnp.sum(change, axis=0) / (2 * scale)
+        bend = (jnp.asarray(self.beta) - jnp.asarray(self.alpha) ** 2) * jnp.outer(shift, shift)
+        cross = offsets.T @ (change[:n] - change[n:]) / (2 * scale)
+        return Transformed(values[0] + shift, change.T @ change / (2 * scale) + bend, cross)
+
+
+def unscented_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: "Channel",
+    alpha: float = 1e-3,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+    update: "AbstractUpdate | None" = None,
+    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+) -> "GaussianFilter":
+    """Unscented Kalman filter (UKF) on its channel's second moments; the points are redrawn after each prediction.
+
+    Merwe's points by default; Julier's are alpha = 1, beta = 0; with kappa = 0 besides it is `cubature_filter`, which
+    needs no choice of a parameter.
+
+    Args:
+        plant: the plant, n states.
+        sensor: its sensor, m outputs.
+        channel: from the sensor to the filter. The memory of a channel is ignored.
+        alpha: spread of the points, above 0.
+        beta: weight of the mean's curvature, 2 for a Gaussian state.
+        kappa: second spread; alpha^2 kappa + beta n may not be negative.
+        update: how an uncertain channel is bounded; `Polytope()` by default.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: as `cubature_filter`.
+
+    Raises:
+        ValueError: parameters whose covariance may be indefinite; sensor, channel and plant that do not fit, or an
+            initial covariance that is none.
+
+    Source: Wan and van der Merwe, The unscented Kalman filter (2001).
+    """
+    transform = Unscented(alpha, beta, kappa)
+    check_plant(plant)
+    transform.check(len(first(plant).states))
+    return gaussian_filter(plant, sensor, channel, transform, update, initial_mean, initial_covariance)

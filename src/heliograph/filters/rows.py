@@ -1,0 +1,114 @@
+"""Rows of data through a filter: one scan, and the estimates and innovations that come of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.codegen.engine import computed
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+
+if TYPE_CHECKING:
+    from heliograph.filters.base import AbstractFilter
+
+
+@readable
+@dataclass(frozen=True)
+class Filtered:
+    """Estimates and innovations of a filter over rows of data: row k is given the rows up to k.
+
+    Args:
+        means: posterior means (steps, n).
+        covariances: what is claimed of their errors (steps, n, n).
+        innovations: z - E[z | earlier rows] (steps, received), NaN for what did not arrive.
+        innovation_covariances: (steps, received, received).
+        log_likelihoods: log p(z_k | earlier rows) of each row (steps,), in nats.
+        claim: what the covariances are: "exact", "upper", "nominal" or "none".
+    """
+
+    means: "Float[np.ndarray, 'steps n']"
+    covariances: "Float[np.ndarray, 'steps n n']"
+    innovations: "Float[np.ndarray, 'steps m']"
+    innovation_covariances: "Float[np.ndarray, 'steps m m']"
+    log_likelihoods: "Float[np.ndarray, ' steps']"
+    claim: Claim
+
+    @property
+    def log_likelihood(self) -> float:
+        """log p(z_1, z_2, ...): the sum over the rows."""
+        return float(np.sum(self.log_likelihoods))
+
+
+def over_rows(
+    item: "AbstractFilter",
+    z: Float[Array, "steps received"],
+    u: Float[Array, "steps inputs"],
+    result: Callable[[PyTree, Innovation, jax.Array], PyTree],
+) -> PyTree:
+    """Step a filter over rows inside a compiled computation: result(state, innovation, k) of each, stacked."""
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        k, z_k, u_k = row
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        return after, result(after, innovation, k)
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+
+
+def filtered(item: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Filtered:
+    """Run a filter over rows of data, by native code where it supports the filter."""
+    mean, covariance, innovation = computed(_results, _by_xla, (item, *data_of(item, z, u)))
+    return Filtered(mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, item.claim)
+
+
+def _results(item: "AbstractFilter", z: Array, u: Array) -> PyTree:
+    def single(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+        estimate = item.after_step(state, k)
+        return estimate.mean, estimate.covariance, innovation
+
+    return over_rows(item, z, u, single)
+
+
+_by_xla = quickly_compiled(_results)
+
+
+def data_of(
+    item: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
+) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
+    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed.
+
+    Raises:
+        ValueError: another shape than the filter's, infinite values, missing inputs, more steps than the filter covers.
+    """
+    z = rows("measurements", measurements, None, item.received or None, missing=True)
+    z = z if item.received else z[:, :0]
+    given = np.zeros((len(z), 0)) if inputs is None and not item.inputs else inputs
+    u = rows("inputs", given, len(z), len(item.inputs), missing=False)
+    if item.horizon is not None and len(z) > item.horizon:
+        raise fail("measurements", f"at most {item.horizon} steps, which the filter covers", len(z))
+    return z, u
+
+
+def rows(
+    name: str, value: ArrayLike | None, steps: int | None, length: int | None, missing: bool
+) -> Float[Array, "steps n"]:
+    """Return an array of `length` numbers a step, one axis standing for one number; NaN where `missing` is allowed."""
+    if isinstance(value, jax.core.Tracer):
+        return value
+    if value is None:
+        raise fail(name, f"shape ({steps}, {length})", "none")
+    try:
+        values = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise fail(name, "an array of numbers", repr(value)[:60]) from None
+    values = values[:, None] if values.ndim == 1 and length in (1, None) else values
+    result: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
+    return result

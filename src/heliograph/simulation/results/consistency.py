@@ -1,0 +1,188 @@
+"""Consistency of estimates and innovations on plain arrays: squared errors in units of what is claimed of them."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from heliograph.numerics.check import array, check_count, fail, rank, scalar
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.small_matrix import squared_distance
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+DIMENSION_WORDS = "the degrees of freedom: a positive number, or one of each value"
+
+
+@readable
+@dataclass(frozen=True)
+class Consistency:
+    """Comparison of NEES or NIS values with what a true claim implies.
+
+    Args:
+        mean: mean of the values that are not NaN.
+        expected: its expectation where the claim is true: the mean number of degrees of freedom.
+        interval: (low, high) that holds the mean with the confidence where the claim is true and values are
+            independent.
+        means: mean over the runs at each step (steps,); the values themselves of one run.
+        intervals: (low, high) of each step's mean over the runs (steps, 2), whose independence does not rest on the
+            steps'.
+        autocorrelation: of the values over 1, 2, ... steps (lags,): near 0 for the NIS of a filter that uses all that
+            it receives; the NEES of one run is always correlated, and its interval then too narrow.
+        autocorrelation_bound: half-width of the interval about 0 that holds each of them with the confidence.
+    """
+
+    mean: float
+    expected: float
+    interval: tuple[float, float]
+    means: Float[np.ndarray, " steps"]
+    intervals: Float[np.ndarray, "steps 2"]
+    autocorrelation: Float[np.ndarray, " lags"]
+    autocorrelation_bound: float
+
+    @property
+    def consistent(self) -> bool:
+        """True where the mean is within its interval."""
+        return self.interval[0] <= self.mean <= self.interval[1]
+
+
+def nees(
+    truth: Float[ArrayLike, "*steps n"], mean: Float[ArrayLike, "*steps n"], covariance: Float[ArrayLike, "*steps n n"]
+) -> Float[np.ndarray, "*steps"]:
+    """Return the normalised estimation error squared (NEES), e' P^-1 e with e = truth - mean: one number a step.
+
+    Its expectation is n where P = E[e e']; where e is Gaussian besides, it has a chi-squared law with n degrees of
+    freedom (`hg.consistency`). A component that P says is known exactly counts 1 if it is, and is infinite if not.
+
+    Args:
+        truth: true states, NaN where a component is not known: the others are judged, by their part of P.
+        mean: estimates, NaN where there is none.
+        covariance: what is claimed of their errors.
+
+    Raises:
+        ValueError: shapes that do not fit, numbers that are not finite.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
+    """
+    axes = max(rank("truth", truth), 1)
+    x = array("truth", truth, (None,) * axes, missing=True)
+    m = array("mean", mean, x.shape, missing=True)
+    return _squared(x - m, array("covariance", covariance, (*x.shape, x.shape[-1]), missing=True), x)
+
+
+def nis(
+    innovation: Float[ArrayLike, "*steps m"], covariance: Float[ArrayLike, "*steps m m"]
+) -> Float[np.ndarray, "*steps"]:
+    """Return the normalised innovation squared (NIS), e' S^-1 e of an innovation e: one number a step, without a truth.
+
+    Its expectation is the number of components that arrived; NaN where none did. A gate (a test whether a measurement
+    belongs to the target) compares it with a quantile of the chi-squared law.
+
+    Args:
+        innovation: z - E[z | earlier z], NaN for what did not arrive: `filter.run(z).innovations`.
+        covariance: its covariance: `filter.run(z).innovation_covariances`.
+
+    Raises:
+        ValueError: shapes that do not fit, infinite numbers.
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
+    """
+    axes = max(rank("innovation", innovation), 1)
+    e = array("innovation", innovation, (None,) * axes, missing=True)
+    return _squared(e, array("covariance", covariance, (*e.shape, e.shape[-1]), missing=True), np.zeros_like(e))
+
+
+def _squared(
+    x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
+) -> Float[np.ndarray, "*steps"]:
+    """x' P^-1 x of each step, over the components that are not NaN; NaN where all are.
+
+    `size`: what x is a difference of, for its rounding.
+    """
+    # A missing component: zero, of variance 1, correlated with nothing.
+    there, n = ~np.isnan(x), x.shape[-1]
+    both = there[..., :, None] & there[..., None, :]
+    filled = np.where(both, covariance, np.eye(n) * ~there[..., None, :])
+    # The axis of steps last.
+    parts = filled.reshape(-1, n, n), np.where(there, x, 0.0).reshape(-1, n), np.nan_to_num(size).reshape(-1, n)
+    first, *others = (np.moveaxis(part, 0, -1) for part in parts)
+    value = np.asarray(_distance(first, *others)).reshape(x.shape[:-1])
+    # Each missing component added nothing: 0^2 / 1.
+    return np.asarray(np.where(there.any(axis=-1), value, np.nan))
+
+
+@compiled
+def _distance(a: Array, x: Array, size: Array) -> Array:
+    return squared_distance(jnp.asarray(a), jnp.asarray(x), size)
+
+
+def consistency(
+    values: Float[ArrayLike, "*runs steps"],
+    dimension: Float[ArrayLike, "*steps"],
+    confidence: float = 0.95,
+    lags: int = 10,
+) -> Consistency:
+    """Compare NEES or NIS values with the chi-squared law that a true claim implies.
+
+    Values of N steps and runs with nu degrees of freedom each: N times their mean has a chi-squared law with N nu
+    degrees where they are independent.
+
+    Args:
+        values: NEES or NIS (steps,) of one run, or (runs, steps); NaN counts as missing.
+        dimension: degrees of freedom of each value: the number of states for NEES, of received components for NIS, one
+            number or an array like `values`.
+        confidence: probability of each interval; 0.95 by default.
+        lags: number of lags of the autocorrelation; 10 by default, fewer where there are too few steps.
+
+    Raises:
+        ValueError: another shape, no values, a dimension that is not positive, a confidence outside (0, 1).
+
+    Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
+    """
+    # Arguments: values (runs, steps) and degrees of freedom of each.
+    given = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
+    rows = np.atleast_2d(given)
+    level = float(scalar("confidence", confidence, 0.0, 1.0))
+    if not 0 < level < 1:
+        raise fail("confidence", "a number between 0 and 1", confidence)
+    there = ~np.isnan(rows)
+    try:
+        degrees = np.broadcast_to(np.asarray(dimension, dtype=np.float64), rows.shape)
+    except (TypeError, ValueError):
+        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60]) from None
+    if not there.any():
+        raise fail("values", "at least one that is not NaN", f"shape {given.shape}")
+    if not (np.isfinite(degrees[there]).all() and (degrees[there] > 0).all()):
+        raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60])
+    # Means and intervals: of all values, and of each step over the runs.
+    freedom = np.where(there, degrees, 0.0)
+    total = np.where(there, rows, 0.0)
+    count = there.sum(axis=0)
+    by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
+    quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
+    ends = _interval(freedom.sum(), there.sum(), quantiles)
+    every = np.stack([_interval(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
+    apart = np.where(there, rows - total.sum() / there.sum(), 0.0)
+    correlation = _autocorrelation(apart, min(check_count("lags", lags), len(count) - 1))
+    return Consistency(
+        mean=float(total.sum() / there.sum()),
+        expected=float(freedom.sum() / there.sum()),
+        interval=(float(ends[0]), float(ends[1])),
+        means=by_step,
+        intervals=every,
+        autocorrelation=correlation,
+        autocorrelation_bound=float(stats.norm.ppf(quantiles[1]) / np.sqrt(there.sum())),
+    )
+
+
+def _interval(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Quantiles of the mean of `count` values with so many degrees of freedom together."""
+    return np.asarray(stats.chi2.ppf(quantiles, degrees) / count) if count else np.full(2, np.nan)
+
+
+def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
+    """Correlation of deviations from their mean over 1, 2, ... steps, a missing one as zero."""
+    power = np.sum(apart**2)
+    sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]
+    return np.asarray([s / power if power > 0 else 0.0 for s in sums])

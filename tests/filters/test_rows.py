@@ -1,0 +1,76 @@
+"""A filter over rows of data: its estimates and innovations against its steps, one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.codegen.engine import chosen
+from heliograph.filters.rows import _results, data_of
+from tests.follow import follow
+
+PLANT, SENSOR = hg.state_space(
+    [[1.0, 1.0], [0.0, 0.9]], [[1.0, 0.0], [0.0, 1.0]], 0.1, 0.5, [0.0, 0.0], 1.0, [[0.0], [1.0]]
+)
+RELAY = hg.hop(hg.Discrete([0.5, 1.2], [0.4, 0.6]), 0.1, dimension=2)
+RNG = np.random.default_rng(3)
+Z, U = RNG.normal(size=(20, 2)), RNG.normal(size=(20, 1))
+Z[[3, 4, 4, 9], [0, 0, 1, 1]] = np.nan
+
+
+@pytest.mark.parametrize("item", [hg.kalman_filter(PLANT, SENSOR), hg.linear_filter(PLANT, SENSOR, RELAY)])
+def test_it_is_the_steps_of_the_filter(item):
+    by_rows, by_steps = item.run(Z, U), follow(item, Z, U)
+    close = dict(rtol=1e-12, atol=1e-12)  # numbers of size one, other orders of sums
+    np.testing.assert_allclose(by_rows.means, by_steps.mean, **close)
+    np.testing.assert_allclose(by_rows.covariances, by_steps.covariance, **close)
+    np.testing.assert_allclose(by_rows.innovations, by_steps.innovation.value, **close)
+    np.testing.assert_allclose(by_rows.innovation_covariances, by_steps.innovation.covariance, **close)
+    np.testing.assert_allclose(by_rows.log_likelihood, hg.log_likelihood(item, Z, U), rtol=1e-12)
+    assert np.isnan(by_rows.innovations).tolist() == np.isnan(Z).tolist()
+    assert by_rows.claim == item.claim == "exact"
+
+
+def test_native_code_computes_it():
+    item = hg.cubature_filter(PLANT, SENSOR, RELAY)
+    choice = chosen(_results, (item, *data_of(item, Z, U)), [False] * 3)
+    assert choice.code is not None, choice.why
+
+
+def test_rows_of_one_number_need_no_second_axis():
+    plant, sensor = hg.state_space([[0.9]], [[1.0]], 1.0, 1.0, [0.0], 1.0)
+    item = hg.kalman_filter(plant, sensor)
+    assert np.array_equal(item.run(Z[:, 0]).means, item.run(Z[:, :1]).means)
+    assert item.run([1.0, np.nan, 2]).means.shape == (3, 1)
+    assert item.run(np.zeros(0)).means.shape == (0, 1) and item.run(np.zeros(0)).log_likelihood == 0
+
+
+@pytest.mark.parametrize(
+    ("z", "u", "words"),
+    [
+        (np.zeros((4, 3)), np.zeros((4, 1)), "measurements: expected"),
+        (np.zeros((4, 2)), np.zeros((3, 1)), "inputs"),
+        (np.zeros((4, 2)), None, "inputs: expected shape .* got none"),
+        (np.full((4, 2), np.inf), np.zeros((4, 1)), "finite"),
+        ("junk", np.zeros((4, 1)), "numbers"),
+    ],
+)
+def test_what_does_not_fit_is_refused(z, u, words):
+    with pytest.raises(ValueError, match=words):
+        hg.kalman_filter(PLANT, SENSOR).run(z, u)
+
+
+def test_a_matrix_that_does_not_fit_is_named():
+    with pytest.raises(ValueError, match="sensor: expected to measure a state of length 2, got a matrix of shape"):
+        hg.state_space(np.eye(2), [[1.0]], 1.0, 1.0, [0.0, 0.0], 1.0)
+
+
+def test_likelihoods_are_differentiated_through_the_same_scan():
+    def value(q):
+        plant, sensor = hg.state_space([[0.9]], [[1.0]], q, 1.0, [0.0], 1.0)
+        return hg.log_likelihood(hg.kalman_filter(plant, sensor), Z[:, 0])
+
+    with jax.enable_x64(True):
+        slope = jax.grad(value)(jnp.asarray(0.5))
+    assert slope == pytest.approx((value(0.5 + 1e-5) - value(0.5 - 1e-5)) / 2e-5, rel=1e-7)  # central difference

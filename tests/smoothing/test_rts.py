@@ -1,0 +1,33 @@
+"""The Rauch-Tung-Striebel smoother against the textbook's pass back."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+
+F, H = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[1.0, 0.0]])
+Q, R = np.array([[0.1, 0.02], [0.02, 0.2]]), np.array([[0.4]])
+PLANT, SENSOR = hg.state_space(F, H, Q, R, [0.3, -0.1], 0.5)
+Z = np.random.default_rng(5).normal(size=25)
+Z[[4, 11]] = np.nan
+
+
+def test_it_is_the_textbooks_pass_back():
+    item = hg.kalman_filter(PLANT, SENSOR)
+    forward, result = item.run(Z), hg.rts_smoother(item, Z)
+    x, P = forward.means.copy(), forward.covariances.copy()
+    for k in range(len(Z) - 2, -1, -1):
+        prior = F @ P[k] @ F.T + Q
+        G = P[k] @ F.T @ np.linalg.inv(prior)
+        x[k] = x[k] + G @ (x[k + 1] - F @ x[k])
+        P[k] = P[k] + G @ (P[k + 1] - prior) @ G.T
+    np.testing.assert_allclose(result.means, x, atol=1e-12)  # numbers of size one
+    np.testing.assert_allclose(result.covariances, P, atol=1e-12)
+    assert result.claim == "exact"
+
+
+def test_what_cannot_be_smoothed_is_refused():
+    with pytest.raises(ValueError, match="filter: expected a filter, such as kalman_filter"):
+        hg.rts_smoother(PLANT, Z)
+    with pytest.raises(ValueError, match="measurements: expected"):
+        hg.rts_smoother(hg.kalman_filter(PLANT, SENSOR), np.zeros((3, 2)))
