@@ -40,8 +40,8 @@ class Numbers(NamedTuple):
 
 
 # Round numbers: a walker changes speed by 0.3 m/s in a second; by their data sheet radios are precise to 2 to 4 cm and
-# accurate to 10 cm; stamps are late by a slot or two. Those of the rule with memory, its form, and its errors' sizes and
-# times above were chosen with the drives los_a1, los_b3, nlos_a1 and nlos_b4 in view: only others test them.
+# accurate to 10 cm; stamps are late by a slot or two. The form of the rule with memory, its numbers, and the sizes and
+# times of its errors above were chosen with los_a1, los_b3, nlos_a1 and nlos_b4 in view: only other drives test them.
 WALK, LATE, ACCURACY = 0.1, 0.15, 0.1
 STARTS = {
     "plain": Numbers(WALK, 1.0, ACCURACY, LATE),
