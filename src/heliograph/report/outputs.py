@@ -20,7 +20,7 @@ class OutputHealth(NamedTuple):
     """Innovations of one received number under one filter.
 
     weighs: whether the filter weighs what arrives. outlying: whether more of its values are down-weighted than of the
-    filter's others together, by its own interval.
+    filter's others together, by an interval of the difference.
     """
 
     node: str

@@ -257,8 +257,8 @@ def outputs_table(health: Health) -> list[Table]:
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
-        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its interval "
-        "lies above the share of the filter's other outputs together."
+        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its share "
+        "lies above that of the filter's other outputs together, by an interval of the difference."
     )
     return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
 
