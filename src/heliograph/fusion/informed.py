@@ -14,6 +14,7 @@ from heliograph.fusion.mesh.weights import (
     arrived_weights,
     arrived_weights_by_component,
     component_weights,
+    weighted_by_component,
 )
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
@@ -168,9 +169,9 @@ class DiagonalWeights(AbstractWeights):
         """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
         if believed.joint is None or self.with_mean or len(believed.present) > SHORT:
             return super().neighbour_weights(believed)
-        chosen, covariance = component_weights(believed.joint, believed.present)
-        one = jnp.eye(len(covariance))
-        return Weights(one, chosen[:, :, None] * one, covariance)
+        chosen = component_weights(believed.joint, believed.present)
+        one = jnp.eye(chosen.shape[1])
+        return Weights(one, chosen[:, :, None] * one, weighted_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.linalg import regular_solve
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import add, factor, identity, minus, symmetric
+from heliograph.numerics.small_matrix import add, diagonal_of, factor, identity, minus, symmetric
 from heliograph.numerics.types import Bool, Float
 
 SHORT = 24  # unknowns of equations that are solved side by side, operation by operation
@@ -59,7 +59,7 @@ def arrived_weights_by_component(
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
     if degree <= SHORT:
-        return jnp.einsum("ia,ab->aib", component_weights(joint, present)[0], jnp.eye(n))
+        return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
 
     def single(item: jax.Array) -> jax.Array:
@@ -71,8 +71,8 @@ def arrived_weights_by_component(
 @runs_last
 def component_weights(
     joint: Float[jax.Array, "degree n degree n *#runs"], present: Bool[jax.Array, "degree *#runs"]
-) -> tuple[Float[jax.Array, "degree n *#runs"], Float[jax.Array, "n n *#runs"]]:
-    """Diagonals c_i of the weights of each component by itself, and C P C'.
+) -> Float[jax.Array, "degree n *#runs"]:
+    """Diagonals c_i of the weights of each component by itself.
 
     Of one component, c = U^-1 1 / 1' U^-1 1 over those that are present, by the factor of U, as `arrived_weights`.
     """
@@ -80,15 +80,21 @@ def component_weights(
     there = present.astype(joint.dtype)[:, None]
     # U of all components side by side, with those that are absent apart.
     component = jnp.stack([joint[:, a, :, a] for a in range(n)], axis=2)
-    mean = add([there[i] * component[i, i] for i in range(degree)]) / add(list(there))
-    ridge = RIDGE * jnp.where(mean > 0, mean, 1.0)
-    apart = jnp.where(there > 0, ridge, 1.0)
+    # Library sums, which the compiler does not repeat in everything that uses them.
+    mean = jnp.sum(there * diagonal_of(component) / jnp.sum(there, axis=0), axis=0)
+    apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
     total = there[:, None] * there * component + identity(degree, component) * apart[:, None]
     solved = _solved(total, there * jnp.ones_like(mean))
-    weights = solved / add(list(solved))
-    # C P C', a sum over senders at a time.
-    sums = add([joint[:, :, j] * weights[j] for j in range(degree)])
-    return weights, symmetric(add([weights[i][:, None] * sums[i] for i in range(degree)]))
+    return solved / jnp.sum(solved, axis=0)
+
+
+@runs_last
+def weighted_by_component(
+    weights: Float[jax.Array, "degree n *#runs"], joint: Float[jax.Array, "degree n degree n *#runs"]
+) -> Float[jax.Array, "n n *#runs"]:
+    """C P C' of diagonal weights, a sum over senders at a time."""
+    sums = add([joint[:, :, j] * weights[j] for j in range(len(weights))])
+    return symmetric(add([w[:, None] * s for w, s in zip(weights, sums, strict=True)]))
 
 
 def arrived_scalar_weights(
