@@ -170,8 +170,8 @@ class DiagonalWeights(AbstractWeights):
         if believed.joint is None or self.with_mean or len(believed.present) > SHORT:
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
-        one = jnp.eye(chosen.shape[1])
-        return Weights(one, chosen[:, :, None] * one, weighted_by_component(chosen, believed.joint))
+        identity = jnp.eye(chosen.shape[1])
+        return Weights(identity, chosen[:, :, None] * identity, weighted_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):

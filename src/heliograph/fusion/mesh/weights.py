@@ -92,7 +92,7 @@ def component_weights(
 def weighted_by_component(
     weights: Float[jax.Array, "degree n *#runs"], joint: Float[jax.Array, "degree n degree n *#runs"]
 ) -> Float[jax.Array, "n n *#runs"]:
-    """C P C' of diagonal weights, a sum over senders at a time."""
+    """Covariance C P C' of diagonal weights, a sum over senders at a time."""
     sums = add([joint[:, :, j] * weights[j] for j in range(len(weights))])
     return symmetric(add([w[:, None] * s for w, s in zip(weights, sums, strict=True)]))
 
