@@ -1,5 +1,6 @@
 """Anything in place of anything, and what a public function may do with it: work, or say in one line what is wrong."""
 
+import inspect
 import re
 import signal
 from contextlib import contextmanager
@@ -63,7 +64,7 @@ def judged(call, arguments):
     try:
         with ending(SECONDS), without_checker():
             result = call(**arguments)
-            false = [] if call is hg.model.Estimate else false_claims(result)  # which claims what it is given
+            false = [] if inspect.isclass(call) else false_claims(result)  # a class holds what it is given
     except (ValueError, TypeError) as error:
         message = str(error)
         assert "\n" not in message and len(message) < LENGTH
@@ -74,7 +75,7 @@ def judged(call, arguments):
 
 
 def false_claims(result):
-    """What a result claims of NaN: an estimate by its claim, a filter's live estimates, a record that names no failure."""
+    """What a result claims of NaN: an estimate by its claim, a filter live, a record without failures."""
     if isinstance(result, hg.model.Estimate):
         return [] if np.ndim(result.mean) != 1 or (result.claims == result.claim).all() else [result]
     if isinstance(result, filters.AbstractFilter):

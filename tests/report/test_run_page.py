@@ -82,10 +82,10 @@ def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
     record = hg.run(network, {"a": z}, truth=np.zeros((30, 2)))
     health_ = examine(network, record, np.zeros((30, 0)))
     claims = {item.filter: item.claim for item in health_.filters}
-    beside = {item.filter: item.claim for item in errors_of(record)}
+    of_errors = {item.filter: item.claim for item in errors_of(record)}
     summary = run_summary(health_)["filters"]["a"]
     expected = {"losing": "none", "kalman": "exact"}
-    assert claims == beside == {name: part["claim"] for name, part in summary.items()} == expected
+    assert claims == of_errors == {name: part["claim"] for name, part in summary.items()} == expected
     assert [row[:2] for row in errors_table(record)[0].rows] == [["a/losing", "none"], ["a/kalman", "exact"]]
 
 

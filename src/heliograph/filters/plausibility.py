@@ -61,8 +61,8 @@ def greatest_distance(dtype: np.dtype) -> float:
 class Judgement(NamedTuple):
     """Judgement of one step of a filter.
 
-    distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known (any more); arrived: how
-    many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
+    distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known (any more); arrived:
+    how many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
     rounding, NaN where no covariance is claimed. All are numbers, so that a judgement is a row of an array.
     """
 

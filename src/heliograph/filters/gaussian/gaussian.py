@@ -216,8 +216,8 @@ def gaussian_filter(
     (then it is the Kalman filter).
 
     Raises:
-        ValueError: sensor, channel and plant that do not fit, an initial covariance that is none, what is no transform or
-            update.
+        ValueError: sensor, channel and plant that do not fit, an initial covariance that is none, what is no transform
+            or update.
 
     Source: cubature fusion under amplify-and-forward relays, Section III.
     """
