@@ -9,7 +9,7 @@ from heliograph.simulation.description.doubts import doubts_before_data, observa
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.9]], 0.1 * np.eye(2), [0, 0], np.eye(2), states=["position", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.1, outputs=["y"])
-RELAYED = hg.amplify_and_forward([hg.hop(hg.Rician(0.9, 0.2), 0.1), hg.hop(1.0, 0.1, amplification=1.1)])
+RELAYED = hg.amplify_and_forward([hg.hop(hg.random_affine.Rician(0.9, 0.2), 0.1), hg.hop(1.0, 0.1, amplification=1.1)])
 STREET = hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.1, 0.1), 0.1, 0.2, name="street")
 
 
@@ -37,9 +37,9 @@ def test_a_network_prints_as_plant_nodes_from_sensor_to_filters_fusions_and_what
     [
         (hg.perfect(), "direct"),
         (hg.dropout(hg.perfect(), 0.9), "direct, 10% lost unnoticed"),
-        (hg.with_direct_link(RELAYED, hg.perfect()), "(Rician hop → hop 1.1 | direct)"),
+        (hg.model.with_direct_link(RELAYED, hg.perfect()), "(Rician hop → hop 1.1 | direct)"),
         (hg.model.delayed(hg.hop(1.0, 0.1), 2), "hop, 2 steps late"),
-        (hg.autoregressive_fading(1.0, 0.1, 0.9, 0.1), "drifting hop"),
+        (hg.model.autoregressive_fading(1.0, 0.1, 0.9, 0.1), "drifting hop"),
         (hg.model.over_time([hg.hop(1.0 + k, 0.1) for k in range(3)]), "varying over time, at first hop"),
     ],
 )
