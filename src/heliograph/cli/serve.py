@@ -52,7 +52,7 @@ def serve(
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import ServiceSettings, run, store_of
+    from heliograph.serving.running import ServiceSettings, name_of, run, store_of
 
     # The schema needs no network.
     if schema:
@@ -76,5 +76,6 @@ def serve(
         page,
         tuple(anew or ()),
         module.get("sources"),
+        name_of(network),
     )
     asyncio.run(run(settings))
