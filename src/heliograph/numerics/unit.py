@@ -1,5 +1,7 @@
 """Names with units: a text that also has a unit, so that whatever only needs the name does not change."""
 
+from collections.abc import Iterable
+
 
 class NameWithUnit(str):
     """Name of a state, output or input with its unit; equal to, and hashed as, the name alone.
@@ -30,3 +32,8 @@ def with_unit(name: str) -> str:
     """Return a name with its unit in parentheses, if it has one, as on an axis: "position (m)"."""
     unit = unit_of(name)
     return f"{name} ({unit})" if unit else str(name)
+
+
+def units_in(names: Iterable[str]) -> dict[str, str]:
+    """Return the units of names that have one, by name."""
+    return {str(name): unit for name in names if (unit := unit_of(name))}
