@@ -43,6 +43,7 @@ class ServiceSettings:
         anew: names of plants that begin anew.
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
         name: name of the network on the page.
+        accept_changes: whether the plants of a store whose network has changed go on with what fits.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -59,6 +60,7 @@ class ServiceSettings:
     anew: tuple[str, ...] = ()
     sources: object = None
     name: str = ""
+    accept_changes: bool = False
 
     def __post_init__(self) -> None:
         if self.snapshot is not None:
@@ -153,12 +155,14 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Open the store, with the snapshot and the plants to begin anew, and report its state."""
     if settings.store is None:
         return InMemoryStore()
+    from heliograph.serving.storage.carrying import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)
-    store = Store(settings.store, mine, settings.process)
+    carrier = Carrier(fleet, mine, _say) if settings.accept_changes else None
+    store = Store(settings.store, mine, settings.process, carrier=carrier)
     if settings.snapshot is not None:
-        store.begin_from(str(settings.snapshot), mine)
+        store.begin_from(str(settings.snapshot), mine, carrier)
     store.begin_anew(settings.anew)
     if store.damaged:
         _say(f"store {store.name}: {report_damage(store.damaged)}")
