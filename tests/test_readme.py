@@ -122,7 +122,7 @@ def against_peers() -> dict[str, list[str]]:
 def test_every_row_beside_peers_names_a_command_that_there_is():
     """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
     rows = against_peers()
-    assert len(rows) == 10
+    assert len(rows) == 12
     for others, ours, command in rows.values():
         assert others and ours
         kind, *words = shlex.split(command.strip("`"))

@@ -153,7 +153,7 @@ def test_a_refusal_in_a_process_of_its_own(folder):
     command = [sys.executable, "-m", "heliograph", *run_arguments()]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
     assert done.returncode == 2
-    assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, got")
+    assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, truth.")
     assert done.stderr.count("\n") == 1 and done.stdout == ""
     assert contents(folder) == before
 

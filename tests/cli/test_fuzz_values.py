@@ -13,6 +13,8 @@ from tests.junk import ending
 
 WORDS = {  # words with which a command works, or with which it says what is not there
     "new": ["made.py"],
+    "check": ["net.py"],
+    "inspect": ["nothing.mcap"],
     "run": ["net.py", "--measurements", "data.csv", "--out", "o.csv"],
     "fit": ["net.py", "--measurements", "data.csv", "--out", "o"],
     "serve": ["net.py", "--store", "none"],
