@@ -191,6 +191,7 @@ def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate)
             result.append(
                 (_headed(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
             )
+    # Covariances of two states have the product of their units.
     if estimate.claim != "none":
         for i, a in enumerate(states):
             for j in range(i + 1, len(states)):

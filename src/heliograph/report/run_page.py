@@ -178,6 +178,7 @@ def errors_table(record: Record) -> list[Table]:
          "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
         for item in errors_of(record)
     ]  # fmt: skip
+    # What the columns are, in words.
     caption = (
         "Root mean square error of each state against the truth in the recording. **NEES**: squared error over the "
         "claimed one, per state: 1 where the claim holds, above 1 too sure."

@@ -288,6 +288,7 @@ class Watch:
         tests: Mapping[tuple[str, str], RunningNis],
         senders: Mapping[str, Mapping[str, Any]],
     ) -> Iterator[str]:
+        # Filters that are doubted, senders that are dead, then the nodes' messages.
         for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
                 yield f"{node}/{filter_name}: {doubt}"

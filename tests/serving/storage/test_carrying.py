@@ -64,11 +64,11 @@ def carried(place: str, item: hg.Network, window: float = WINDOW) -> tuple[Servi
 
 def base(place: str, item: hg.Network) -> np.ndarray:
     """State of the filters after the base row of the stored plant, by leaf: (mean, covariance, moments of x) x node."""
-    own = fleet(item)
-    store = Store(place, identity(own))
-    plant = plant_from("p", store.load(["p"])["p"].body, own)
+    here = fleet(item)
+    store = Store(place, identity(here))
+    plant = plant_from("p", store.load(["p"])["p"].body, here)
     store.close()
-    return own.pool.table[plant.rows.held[0].slot, own.pool.state].reshape(4, -1)
+    return here.pool.table[plant.rows.held[0].slot, here.pool.state].reshape(4, -1)
 
 
 def test_another_noise_goes_on_from_the_state_that_was_and_is_named(tmp_path):
@@ -126,8 +126,8 @@ def test_an_option_alone_changes_no_bit_of_what_follows(tmp_path):
     assert [line.split(": ", 1)[1] for line in lines] == ["option window: 5.0 -> 3.0"]
     expected, known = finals(calm, sent(20, 30)), finals(service, sent(20, 30))
     assert set(expected) < set(known) and all(known[time] == expected[time] for time in expected)
-    for one in (calm, service):
-        one.store.close()
+    for running in (calm, service):
+        running.store.close()
 
 
 def test_a_snapshot_is_carried_over_and_stays_as_it_is(tmp_path):
@@ -138,8 +138,8 @@ def test_a_snapshot_is_carried_over_and_stays_as_it_is(tmp_path):
     known = finals(Service(new, store), sent(20, 24))
     service, other = carried(place, network(0.09))
     assert known == finals(service, sent(20, 24)) and lines == other
-    for one in (store, service.store):
-        one.close()
+    for opened in (store, service.store):
+        opened.close()
 
 
 def test_what_cannot_be_carried_over_is_refused_and_nothing_is_changed(tmp_path):
@@ -155,16 +155,16 @@ def test_rows_of_single_events_and_inputs_in_continuous_time_are_carried_over(tm
     messages = written(messages_of(2, 30, seed=3, whole=False))
     results = []
     for accepts in (False, True):
-        place, own = str(tmp_path / f"{accepts}.db"), world(item)
-        store = Store(place, identity(own))
-        service = Service(own, store)
+        place, here = str(tmp_path / f"{accepts}.db"), world(item)
+        store = Store(place, identity(here))
+        service = Service(here, store)
         service.take(messages[:40])
         if accepts:
             store.close()
-            own = world(item, window=4.0)
+            here = world(item, window=4.0)
             said: list[str] = []
-            store = Store(place, identity(own), carrier=Carrier(own, identity(own), said.append))
-            service = Service(own, store)
+            store = Store(place, identity(here), carrier=Carrier(here, identity(here), said.append))
+            service = Service(here, store)
             assert [line.split(": ", 1)[1] for line in said] == ["option window: 5.0 -> 4.0"]
         known = [json.loads(output.body) for output in service.take(messages[40:])]
         results.append({(o["plant"], o["time"]): o["estimates"] for o in known if o["kind"] == "final"})

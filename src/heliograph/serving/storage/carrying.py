@@ -216,6 +216,7 @@ def changes(mine: Identity, other: Identity) -> list[str]:
         and not name.startswith("numbers of ")
         and name not in (DESCRIPTION, "what is computed", "layout of the store")
     ]
+    # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program.
     here, there = (json.loads(item[DESCRIPTION])["values"] for item in (mine, other))
     for part in here:
         if part in there:
