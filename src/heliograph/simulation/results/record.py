@@ -78,7 +78,8 @@ class Record(Saved):
 
     def __post_init__(self) -> None:
         """Take the units of states whose names have one; units given apart come first."""
-        object.__setattr__(self, "units", units_in(self.states) | self.units)
+        if isinstance(self.states, tuple) and (units := units_in(self.states)):
+            object.__setattr__(self, "units", units | self.units)
 
     @property
     def runs(self) -> int | None:
