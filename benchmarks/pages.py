@@ -119,11 +119,22 @@ def claims(soaked: dict[str, Any]) -> list[Place]:
 def places(measured: dict[str, Any]) -> dict[str, list[Place]]:
     """Every place by page."""
     gradient = measured["alone"]["network_design"]["values"]["error and gradient, 6 sensors"]
-    learned = learning(measured)
+    learned, robust = learning(measured), measured["alone"]["robust"]
+    weighed = [robust["values"][name] for name in robust["at_most"]]
+    others = ("Student, variational Bayes", "contaminated, score", "Student, score", "adaptive")
+    doubted = [robust["values"][f"two outputs: {name} over plain"] for name in others]
     return {
         "README.md": readme(measured) + learned["README.md"],
         "docs/comparisons.md": comparisons(measured) + learned["docs/comparisons.md"],
         "docs/network_design.md": [Place("three states and twelve hops take {} ms", (f"{gradient:.1f}",))],
+        "docs/robust.md": [
+            Place("take {} to {} times as long, with", (f"{min(weighed):.2f}", f"{max(weighed):.2f}")),
+            Place(
+                "Bayes\ntakes {}, the score of a contaminated law {}, that of Student's law, a mixture of 25, {}, "
+                "and the adaptive filter {} times\n",
+                tuple(f"{value:.1f}" for value in doubted),
+            ),
+        ],
         "docs/theory.md": claims(json.loads(SOAK.read_text(encoding="utf-8"))),
     }
 

@@ -1,5 +1,6 @@
 """Anything in place of anything, and what a public function may do with it: work, or say in one line what is wrong."""
 
+import inspect
 import re
 import signal
 from contextlib import contextmanager
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from jaxtyping import config
 
 import heliograph as hg
-from heliograph import fusion, random_affine
+from heliograph import filters, fusion, random_affine
+from heliograph.simulation.results.record import Record
 
 EYE = np.eye(2)
 PLANT = hg.LinearPlant(0.9 * EYE, 0.1, [0.0, 0.0], 1.0)
@@ -61,12 +63,39 @@ def judged(call, arguments):
     """
     try:
         with ending(SECONDS), without_checker():
-            call(**arguments)
+            result = call(**arguments)
+            false = [] if inspect.isclass(call) else false_claims(result)  # a class holds what it is given
     except (ValueError, TypeError) as error:
         message = str(error)
         assert "\n" not in message and len(message) < LENGTH
         assert ": expected " in message and ", got " in message, message
         assert not RAW.search(message.partition(": expected ")[2].partition(", got ")[0]), message
+    else:
+        assert not false, false
+
+
+def false_claims(result):
+    """What a result claims of NaN: an estimate by its claim, a filter live, a record without failures."""
+    if isinstance(result, hg.model.Estimate):
+        return [] if np.ndim(result.mean) != 1 or (result.claims == result.claim).all() else [result]
+    if isinstance(result, filters.AbstractFilter):
+        stream = hg.Stream(result)
+        given = np.zeros(len(result.inputs))
+        return [
+            false
+            for z in (0.1, np.nan, 0.2)
+            if result.horizon is None or stream.steps < result.horizon
+            for false in false_claims(stream.push(np.full(result.received, z), given))
+        ]
+    if isinstance(result, Record):
+        lost = [
+            (node, name, estimate)
+            for node, every in result.estimates.items()
+            for name, estimate in every.items()
+            if estimate.claim != "none" and (estimate.claims == "none").any()
+        ]
+        return lost if len(result.failures()) < len(lost) else []
+    return []
 
 
 @contextmanager

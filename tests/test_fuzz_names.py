@@ -38,9 +38,15 @@ SAMPLES = {  # what a parameter of this name usually is
     "maps": [HOP], "relays": ("r",), "joint": np.eye(4), "count": 1, "states": 1,
 }  # fmt: skip
 PROTOCOLS = ("Transport", "Broker")
-WITH_PEERS = {  # what is no function of its arguments alone: it talks to a broker or reads the standard input
-    "connected", "keep_running", "serve_until", "check_transport", "Pipe", "keep_compilations", "show_progress",
-}  # fmt: skip
+WITH_PEERS = {  # what is no function of its arguments alone
+    "connected",  # goes on trying to reach the broker at an address
+    "keep_running",  # a coroutine that ends with its transport's messages
+    "serve_until",  # the same until an event
+    "check_transport",  # waits for a broker's messages
+    "Pipe",  # reads the file of any number that it is given, that of this process's standard input too
+    "keep_compilations",  # changes where JAX keeps programs, of all tests after it
+    "show_progress",  # writes to the terminal until its block ends
+}
 TRACED = {"gaussian_innovation", "mixed_innovation"}  # stand inside a filter that has checked what it was given
 RESULTS = {"StatisticsByName"}  # made by the package alone, from what it has checked
 WITH_ARGUMENTS = {getattr(call, "__name__", "") for call, _ in test_fuzz.CALLS + test_fuzz_rooms.CALLS}
@@ -51,8 +57,10 @@ def tried(place, name):
     item = getattr(import_module(place), name)
     if not callable(item) or inspect.isabstract(item) or name in WITH_PEERS | TRACED | RESULTS | WITH_ARGUMENTS:
         return False
+    # A contract's check fails by AssertionError; a message's model is read by the service, which has the words.
     if place == "heliograph.testing" or (inspect.isclass(item) and issubclass(item, BaseModel)):
         return False
+    # What others derive from does nothing itself, and a tuple of results holds whatever it is given.
     made = inspect.isclass(item) and (name.startswith("Abstract") or name in PROTOCOLS)
     return not made and not (inspect.isclass(item) and issubclass(item, tuple))
 

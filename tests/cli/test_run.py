@@ -60,7 +60,8 @@ def test_a_lost_covariance_is_said_and_flagged(folder, capsys):
     (folder / "net.py").write_text(NETWORK + LOSING)
     assert cli.main(run_arguments()) == 0
     expected = "heliograph: warning: remote/losing: no valid covariance from step 2 in 1 of 1 runs\n"
-    assert capsys.readouterr().err == expected
+    said = capsys.readouterr()
+    assert said.err == expected and said.out == "out.csv: 4 rows of remote/losing (nominal, none of 2 rows)\n"
     table = read_table("out.csv")
     np.testing.assert_array_equal(table["valid"], [1, 1, 0, 0])
     np.testing.assert_array_equal(table["v.sd"], [1, 1, np.nan, np.nan])

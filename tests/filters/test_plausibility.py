@@ -134,4 +134,6 @@ def test_a_filter_that_is_lost_does_not_refuse_for_the_others():
     fine, far, silent = [1.0, 1.0, 0.0, 0.0], [1e20, 1.0, Reason.FAR, 0.0], [np.nan, 1.0, 0.0, np.nan]
     assert why_values(np.array([fine, far])) is None and why_values(np.array([fine, silent])) is None
     assert why_values(np.array([far, silent])) == "more than 1e6 deviations from what was expected (1e+10 of them)"
+    single = why_values(np.array([far, silent], dtype=np.float32))  # eps^-1/2
+    assert single == "more than 2,896 deviations from what was expected (1e+10 of them)"
     assert why_inputs(np.array([[1.0, 1.0, 0.0, 1.0], silent])) and why_inputs(np.array([fine, silent])) is None

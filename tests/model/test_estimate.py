@@ -6,6 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.model import Estimate
 from heliograph.model.estimate import with_sound_claim
+from tests.losing import Losing
 
 MEAN = np.zeros((4, 2))
 COVARIANCE = np.array([np.eye(2), np.full((2, 2), np.nan), np.diag([1.0, -1.0]), np.diag([1.0, 0.0])])
@@ -65,6 +66,13 @@ def test_a_live_estimate_whose_covariance_is_lost_claims_nothing():
         assert result.claim == claim and np.isfinite(result.mean).all()
     timeline.advance(100.0)
     assert timeline.final().estimates["a"]["f"].claims.tolist() == expected
+
+
+@pytest.mark.parametrize("z", [[0.1], [np.nan]])
+def test_a_live_estimate_whose_variance_is_negative_claims_nothing(z):
+    """Whether anything arrived or not: the covariance is lost in the prediction, which no message is refused for."""
+    stream = hg.Stream(Losing())
+    assert [stream.push(z).claim for _ in range(4)] == ["nominal", "nominal", "none", "none"]
 
 
 def test_a_measurement_that_would_lose_the_covariance_is_refused_live_and_the_claim_stays():

@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 import heliograph.serving
-from heliograph.numerics.check import InputError, array, scalar
+from heliograph.numerics.check import TINY, InputError, array, scalar
 
 
 def unpacking(x):
@@ -34,6 +34,7 @@ def single(x):
         (lambda: scalar("x", -1.0, 0.0), "x: expected a number of at least 0, got -1"),
         (lambda: scalar("x", 2.0, -np.inf, 1.0), "x: expected a number of at most 1, got 2"),
         (lambda: scalar("x", 2.0, 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),
+        (lambda: scalar("x", 0.0, TINY, 1.0), "x: expected a positive number up to 1, got 0"),
     ],
 )
 def test_a_line_says_what_to_write(make, line):

@@ -85,6 +85,7 @@ def test_what_has_no_rate_before_data_is_refused_in_one_line():
         (lambda: send_on_delta_rate(two, hg.LinearSensor([[1.0, 0.0]], 1.0), 1.0), "rate before any data: expected a"),
         (lambda: send_on_delta_rate(hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0), SENSOR, 1.0), "plant: expected a stable"),
         (lambda: send_on_delta_rate(PLANT, SENSOR, 20.0), "delta: expected one at which more than 1e-06 messages"),
+        (lambda: send_on_delta_rate(PLANT, SENSOR, 2.0**40), "delta: expected one at which more than 1e-06 messages"),
         (lambda: prediction_error_rate(PLANT, SENSOR, 1.0, 1.0), "loss: expected a number below 1"),
         (lambda: least_error(PLANT, SENSOR, 1.5), "rate: expected a number between 0 and 1"),
     ):

@@ -83,6 +83,7 @@ def test_bounds_of_share_and_size_dominate_every_law_within_them():
         (lambda: hg.StudentT(1.0, 2.0).covariance, r"more than 2, below which it has no covariance \(robust_filter"),
         (lambda: hg.StudentT(1.0, 4.0).moment((4,)), "moments of order 4: expected more than 4, got 4"),
         (lambda: hg.Contaminated(1.0, 1.2, 9.0), "share of outliers: expected a number from 0 to 1, got 1.2"),
+        (lambda: hg.Contaminated(1.0, [], 9.0), "shares of outliers: expected at least one, got none"),
         (lambda: hg.Contaminated(1.0, -0.1, 9.0), "share of outliers: expected a number from 0 to 1, got -0.1"),
         (lambda: hg.Contaminated(1.0, [0.7, 0.7], [1.0, 2.0]), "sum of the shares of outliers"),
         (lambda: hg.Contaminated(1.0, 0.1, -9.0), "covariance of the outliers: expected a positive semidefinite"),

@@ -8,8 +8,10 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
+from heliograph.report.errors import errors_of
 from heliograph.report.health import Link, examine
-from heliograph.report.run_page import rounded, run_figures, run_page, run_summary
+from heliograph.report.run_page import errors_table, rounded, run_figures, run_page, run_summary
+from tests.losing import Losing
 
 STEPS = 300
 DRIFT = 0.95 * np.eye(1)
@@ -68,6 +70,23 @@ def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
     summary = json.loads(json.dumps(run_summary(health)))
     assert summary["rows"] == STEPS and summary["links"][BAD]["right"] == {"arrived": 1 - 4 / STEPS, "longest_gap": 4}
     assert summary["filters"]["a"]["good"]["size"] == health.filters[0].test.power
+
+
+def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
+    """Neither in the table of tests nor beside its errors, nor in the summary."""
+    plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.1)
+    filters = {"losing": Losing(), "kalman": hg.kalman_filter(plant, sensor)}
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), filters)})
+    z = np.random.default_rng(0).normal(size=(30, 1))
+    record = hg.run(network, {"a": z}, truth=np.zeros((30, 2)))
+    health_ = examine(network, record, np.zeros((30, 0)))
+    claims = {item.filter: item.claim for item in health_.filters}
+    of_errors = {item.filter: item.claim for item in errors_of(record)}
+    summary = run_summary(health_)["filters"]["a"]
+    expected = {"losing": "none", "kalman": "exact"}
+    assert claims == of_errors == {name: part["claim"] for name, part in summary.items()} == expected
+    assert [row[:2] for row in errors_table(record)[0].rows] == [["a/losing", "none"], ["a/kalman", "exact"]]
 
 
 NET = """

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.lanes import Lanes
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
+from tests.losing import Losing
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
 READER = TypeAdapter(AnyOutput)
@@ -38,6 +41,24 @@ def finals(known, plant):
         for item in known
         if item["kind"] == "final" and item["plant"] == plant
     ]
+
+
+def test_an_output_claims_nothing_where_covariances_are_no_numbers_or_negative():
+    """Saved gains lose their covariance (NaN) where data are missing, the other filter its own from step 2 on."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    saved = hg.filters.scheduled_polynomial_filter(plant, sensor, hg.perfect(), 6, 1)
+    pair = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
+    row = hg.LinearSensor([[1.0, 0.0]], 0.1)
+    cases = (
+        (hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": saved})}), (0.1, None, 0.2), "exact", 1),
+        (hg.Network(pair, {"a": hg.Node(row, hg.perfect(), {"f": Losing()})}), (0.1, 0.2, 0.3, 0.4), "nominal", 2),
+    )
+    for network, values, claim, lost in cases:
+        sent = [{"node": "a", "sequence": k, "time": k, "values": [z]} for k, z in enumerate(values)]
+        service = Service(Fleet(Lanes(network), Options(WINDOW)), InMemoryStore())
+        outputs = [json.loads(item.body) for item in [*service.take(lines(sent)), *service.finish(ended=True)]]
+        claims = {item["time"]: item["estimates"]["a"]["f"]["claim"] for item in outputs if item["kind"] == "final"}
+        assert claims == {k: claim if k < lost else "none" for k in range(len(values))}
 
 
 @pytest.mark.parametrize("whole", [True, False])

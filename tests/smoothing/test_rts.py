@@ -31,3 +31,19 @@ def test_what_cannot_be_smoothed_is_refused():
         hg.rts_smoother(PLANT, Z)
     with pytest.raises(ValueError, match="measurements: expected"):
         hg.rts_smoother(hg.kalman_filter(PLANT, SENSOR), np.zeros((3, 2)))
+
+
+def test_one_row_is_smoothed_to_what_the_filter_says_and_none_is_refused():
+    """Alone, and in the runs of a simulation."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    item = hg.kalman_filter(plant, sensor)
+    result, forward = hg.rts_smoother(item, [0.3]), item.run([0.3])
+    np.testing.assert_allclose(result.means, forward.means, rtol=1e-14)
+    np.testing.assert_allclose(result.covariances, forward.covariances, rtol=1e-14)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": item})})
+    record = hg.monte_carlo(network, 1, 3, 0, smooth=hg.smoothing.FixedInterval())
+    for part in ("mean", "covariance"):
+        both = (getattr(item.estimates["a"]["f"], part) for item in (record.smoothed, record))
+        np.testing.assert_allclose(*both, rtol=1e-14)
+    with pytest.raises(ValueError, match="measurements: expected at least one row, got none"):
+        hg.rts_smoother(item, [])

@@ -18,7 +18,10 @@ def outcome():
     near = hg.fusion.neighbours_within(places, small.radius)
     nees = {name: 0.9 + 0.02 * i for i, name in enumerate(places)}
     score = compute.Score("upper", 2.5, 2.8, 1.1, (0.9, 1.0), np.linspace(3.0, 2.5, 60), nees)
-    return compute.Outcome(6, 3.3, 0.3, 2.2, dict.fromkeys(figures.RULES, score), places, near, ("n0", "n2", "n4"))
+    bound = np.full(30, 2.2)
+    return compute.Outcome(
+        6, 3.3, 0.3, 2.2, dict.fromkeys(figures.RULES, score), bound, places, near, ("n0", "n2", "n4")
+    )
 
 
 def test_half_of_the_nodes_measure_and_every_rule_is_shown():

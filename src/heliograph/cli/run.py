@@ -85,6 +85,7 @@ def run(
             recording = read_recording(measurements, loaded) if messages is None else messages.recording()
             advance(f"filtering {len(recording.time)} rows")
             record, doubtful = _filtered(loaded, recording, later)
+            notes = _doubted(loaded, record, recording)
         if out is not None:
             advance(f"writing {out}")
             write(record, out)
@@ -161,6 +162,13 @@ def _errors(record: "Record") -> list[str]:
         size = "" if isnan(item.nees) else f"; NEES per state {item.nees:.3g}"
         lines.append(f"{item.node}/{item.filter}: RMSE {rmse}{size}")
     return lines
+
+
+def _doubted(network: "Network", record: "Record", recording: "Recording") -> list[str]:
+    """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
+    from heliograph.report.outputs import weighed_outputs
+
+    return [str(item) for item in weighed_outputs(network, record, recording.inputs)]
 
 
 def _claim(estimate: "Estimate") -> str:

@@ -113,5 +113,5 @@ def _cell(cell: str) -> float | int | str | None:
 def _payload(text: str, where: str) -> object:
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise fail(f"{where}, column {PAYLOAD!r}", "JSON", shown(text)) from None

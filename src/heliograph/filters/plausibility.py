@@ -46,7 +46,6 @@ class Reason(IntEnum):
 
 
 WORDS = {
-    Reason.FAR: f"more than {LIMIT:.0e} deviations from what was expected".replace("e+06", "e6"),
     Reason.EXCLUDED: "a value that the model excludes",
     Reason.UNSOUND: "with it the estimate is no number, or its covariance is none",
     Reason.PREDICTION: "the prediction to its time is no finite number",
@@ -62,8 +61,8 @@ def greatest_distance(dtype: np.dtype) -> float:
 class Judgement(NamedTuple):
     """Judgement of one step of a filter.
 
-    distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known; arrived: how
-    many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
+    distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known (any more); arrived:
+    how many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
     rounding, NaN where no covariance is claimed. All are numbers, so that a judgement is a row of an array.
     """
 
@@ -79,9 +78,13 @@ class Judgement(NamedTuple):
 
 
 def in_words(reason: float, distance: float) -> str:
-    """Describe in words why something is implausible."""
-    far = Reason(int(reason)) == Reason.FAR and np.isfinite(distance)
-    return WORDS[Reason(int(reason))] + (f" ({np.sqrt(distance):.3g} of them)" if far else "")
+    """Describe in words why something is implausible, with the bound of the precision that the distance has."""
+    if Reason(int(reason)) != Reason.FAR:
+        return WORDS[Reason(int(reason))]
+    most = np.sqrt(greatest_distance(np.asarray(distance).dtype))
+    bound = "1e6" if most == LIMIT else f"{most:,.0f}"
+    far = f"more than {bound} deviations from what was expected"
+    return far + (f" ({np.sqrt(distance):.3g} of them)" if np.isfinite(distance) else "")
 
 
 def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
@@ -141,7 +144,7 @@ def judge(
     every, certain = _squares(value, covariance, present, size)
     distance, count = _total(every), _total(present.astype(value.dtype))
 
-    # Far: components larger than expected, beyond LIMIT deviations.
+    # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     part, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
     free = jnp.where(larger & ~determined, part, 0.0)
@@ -153,7 +156,8 @@ def judge(
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
     # States that stop being numbers, by the correction or already by the prediction.
-    unsound = (_sound(prior, claim, before) & ~_sound(after, claim, prior)) | _overflows(states[1], states[2])
+    sound = _sound(after, claim, prior)
+    unsound = (_sound(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
     predicted = (_finite(before, claim) & ~_finite(prior, claim)) | _overflows(states[0], states[1])
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
     reason = jnp.where(unsound & (count > 0) & ~far, Reason.UNSOUND, reason)
@@ -161,7 +165,8 @@ def judge(
     # Inputs that move the mean to where its deviation is below its rounding.
     digits = _some(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
     known = jnp.nan if claim == "none" else digits
-    return Judgement(jnp.where(count > 0, distance, jnp.nan), count, reason.astype(value.dtype), jnp.asarray(known))
+    distance = jnp.where((count > 0) & (sound | (reason > 0)), distance, jnp.nan)
+    return Judgement(distance, count, reason.astype(value.dtype), jnp.asarray(known))
 
 
 def _some(which: jax.Array) -> jax.Array:

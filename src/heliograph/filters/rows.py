@@ -31,6 +31,8 @@ class Filtered:
         innovation_covariances: (steps, received, received).
         log_likelihoods: log p(z_k | earlier rows) of each row (steps,), in nats.
         claim: what the covariances are: "exact", "upper", "nominal" or "none".
+        weights: of each component in its update (steps, received), from 0 (left out) to 1 (in full); None of a filter
+            that weighs nothing.
     """
 
     means: "Float[np.ndarray, 'steps n']"
@@ -39,6 +41,7 @@ class Filtered:
     innovation_covariances: "Float[np.ndarray, 'steps m m']"
     log_likelihoods: "Float[np.ndarray, ' steps']"
     claim: Claim
+    weights: "Float[np.ndarray, 'steps m'] | None" = None
 
     @property
     def log_likelihood(self) -> float:
@@ -66,7 +69,10 @@ def over_rows(
 def filtered(item: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
     mean, covariance, innovation = computed(_results, _by_xla, (item, *data_of(item, z, u)))
-    return Filtered(mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, item.claim)
+    return Filtered(
+        mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, item.claim,
+        innovation.weight,
+    )  # fmt: skip
 
 
 def _results(item: "AbstractFilter", z: Array, u: Array) -> PyTree:

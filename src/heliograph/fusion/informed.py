@@ -8,7 +8,14 @@ import jax.numpy as jnp
 
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
 from heliograph.fusion.mesh.gains import Believed, Weights
-from heliograph.fusion.mesh.weights import arrived_scalar_weights, arrived_weights, arrived_weights_by_component
+from heliograph.fusion.mesh.weights import (
+    SHORT,
+    arrived_scalar_weights,
+    arrived_weights,
+    arrived_weights_by_component,
+    component_weights,
+    weighted_by_component,
+)
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
 from heliograph.model.estimate import Claim
@@ -157,6 +164,14 @@ class DiagonalWeights(AbstractWeights):
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Weights of those that are present."""
         return arrived_weights_by_component(joint, present)
+
+    def neighbour_weights(self, believed: Believed) -> Weights:
+        """Weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
+        if believed.joint is None or self.with_mean or len(believed.present) > SHORT:
+            return super().neighbour_weights(believed)
+        chosen = component_weights(believed.joint, believed.present)
+        identity = jnp.eye(chosen.shape[1])
+        return Weights(identity, chosen[:, :, None] * identity, weighted_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):

@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
-from heliograph.numerics.check import array, check_count, fail, instance, items, probabilities
+from heliograph.numerics.check import array, check_count, fail, instance, items, probabilities, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
@@ -74,7 +74,7 @@ class AbstractFusion(Module):
         return False
 
     def placed(self, graph: Graph) -> "AbstractFusion":
-        """Return the rule with what differs between the rows of a graph along a leading axis of every array."""
+        """Return the rule with what differs between the rows of a graph along the last axis of every array."""
         return self
 
     def neighbour_weights(self, believed: Believed) -> Weights:
@@ -294,9 +294,12 @@ class Fusion(Module):
             channel for each edge by its name "SENDER to RECEIVER"; lossless by default.
         rounds: exchanges of the neighbours at each step, 1 by default; more need a rule that intersects. Measurements
             are forwarded with the name of their node, so that each counts once.
+        alpha: events. A node sends its estimate only if (xhat - xs)' P^-1 (xhat - xs) > alpha n, xs that which it sent
+            last, predicted (at first the plant's mean); its measurement always. Neighbours intersect by the bound
+            (1 + sqrt(alpha n))^2 P of xs, sent or not. For intersections, one round, no link; None by default.
 
     Raises:
-        ValueError: a rule that is none, neighbours that are none, links or rounds without neighbours.
+        ValueError: a rule that is none, neighbours that are none; links, rounds or events without neighbours.
     """
 
     filter: str = eqx.field(static=True)
@@ -306,6 +309,7 @@ class Fusion(Module):
     neighbours: dict[str, tuple[str, ...]] | None = None
     link: Channel | dict[str, Channel] | None = None
     rounds: int = eqx.field(static=True, default=1)
+    alpha: float | None = eqx.field(static=True, default=None)
 
     def __init__(
         self,
@@ -316,6 +320,7 @@ class Fusion(Module):
         neighbours: "Neighbours | None" = None,
         link: "Channel | Mapping[str, Channel] | None" = None,
         rounds: int = 1,
+        alpha: Float[ArrayLike, ""] | None = None,
     ):
         self.filter = instance("filter of a fusion", filter, str, "its name")
         self.rule = instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
@@ -323,8 +328,9 @@ class Fusion(Module):
         self.neighbours = None if neighbours is None else neighbours_of(neighbours)
         self.link = dict(link) if isinstance(link, Mapping) else link
         self.rounds = check_count("rounds of a fusion", rounds)
-        if neighbours is None and (link is not None or rounds > 1):
-            raise fail("fusion", "neighbours, where there are links between them or rounds", "none")
+        self.alpha = None if alpha is None else float(scalar("alpha of a fusion", alpha, 0.0))
+        if neighbours is None and (link is not None or rounds > 1 or alpha is not None):
+            raise fail("fusion", "neighbours, where there are links between them, rounds or events", "none")
         if neighbours is not None and (quantizer is not None or uplink is not None):
             raise fail("fusion between neighbours", "messages that arrive as they are or not at all",
                        "a quantizer" if uplink is None else "an uplink")  # fmt: skip

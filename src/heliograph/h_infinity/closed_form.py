@@ -10,6 +10,7 @@ from heliograph.numerics.types import ArrayLike, Float
 
 ACCURACY = 1e-10  # relative, of a level found by bisection
 SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
+GREATEST = 1e100  # level of a closed form, whose square times squares of matrices doubles hold
 SLACK = 1e-6  # relative strictness that a closed form gives away, so that its certificate has a margin
 
 
@@ -74,11 +75,11 @@ def known_channel_design(
             system that is all linear needs: then this is the H-infinity filter of textbooks.
 
     Raises:
-        ValueError: a channel with random gains, multipliers of the wrong shape, a level that is not positive.
+        ValueError: a channel with random gains, multipliers of the wrong shape, a level not in (0, 1e100].
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level))
+    level = float(scalar("level", level, high=GREATEST))
     if any(len(link.spreads()) for link in system.channel):
         raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
     if not level > 0:

@@ -7,7 +7,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
-from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units
+from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units, rank, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import as_maps
@@ -173,8 +173,9 @@ def _growth(steps: int, name: str, value: Constants) -> Growth:
 
 
 def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
-    weight = np.asarray(value, dtype=np.float64) * np.eye(2 * n) if np.ndim(value) == 0 else value
-    result: np.ndarray = array("initial weight", weight, (2 * n, 2 * n))
+    name, size = "initial weight", 2 * n
+    single = rank(name, value) == 0
+    result: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
     unit = float(np.max(np.abs(result), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
     symmetric = symmetric_weight("initial weight", result / unit)
     if smallest_eigenvalue(symmetric) <= 0:

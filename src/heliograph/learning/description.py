@@ -70,7 +70,7 @@ def describe(network: Build) -> Description:
     function("network to be learned", network, "nothing that returns a Network")
     try:
         signature(network).bind()
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise fail("network to be learned", "a function without arguments", str(error)) from None
     asking = Asking()
     with reading(asking), jax.enable_x64(True):

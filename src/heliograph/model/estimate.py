@@ -31,6 +31,9 @@ class Estimate(Module):
     covariance: Float[Array, "... n n"]
     claim: Claim = eqx.field(static=True)
 
+    def __check_init__(self) -> None:
+        weakest([self.claim])
+
     @property
     def claims(self) -> np.ndarray:
         """The claim of each estimate, (...): "none" where mean or covariance are no numbers, or the latter is none."""

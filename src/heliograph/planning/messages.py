@@ -185,7 +185,8 @@ def _send_on_delta_rate(system: _Scalar, delta: float) -> float:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
     # The rectangle rule next to the cut at delta is wrong by a multiple of h^2: of two grids that is taken off.
     (coarse, h), (fine, half) = (_rate_on_grid(system._replace(c=1.0, r=r), delta, share) for share in (0.8, 0.5))
-    return float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
+    # Where nothing is ever sent both grids are one, and say 0.
+    return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
 def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, float]:

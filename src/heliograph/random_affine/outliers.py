@@ -269,6 +269,8 @@ def _shares(share: ArrayLike) -> tuple[list[Number], bool]:
     if not rank("share of outliers", share):
         return [scalar("share of outliers", share, 0.0, 1.0)], False
     values = array("shares of outliers", share, ("kinds",))
+    if not len(values):
+        raise fail("shares of outliers", "at least one", "none")
     total = sum(scalar("share of outliers", part, 0.0, 1.0) for part in values)
     scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12) if not is_traced(total) else None
     return list(values), True

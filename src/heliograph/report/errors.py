@@ -4,13 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.model.estimate import weakest
 from heliograph.simulation.results.record import Record
 
 
 class Errors(NamedTuple):
     """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
 
-    `nees` is NaN where nothing is claimed.
+    `claim` is what holds in all rows; `nees` is NaN where nothing is claimed.
     """
 
     node: str
@@ -31,5 +32,6 @@ def errors_of(record: Record) -> list[Errors]:
             values = record.nees(node, name)
             judged = ~np.isnan(values)
             size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
-            results.append(Errors(node, name, estimate.claim, record.rmse(node, name), size))
+            claim = weakest(np.unique(estimate.claims).tolist())
+            results.append(Errors(node, name, claim, record.rmse(node, name), size))
     return results

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH
-from heliograph.simulation.network import FUSED, Network, claim_at
+from heliograph.report.outputs import OutputHealth, listeners, outputs_of
+from heliograph.simulation.network import Network, claim_at
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
@@ -60,6 +60,7 @@ class Health:
     record: Record
     links: list[Link]
     filters: list[FilterHealth]
+    outputs: list[OutputHealth]  # by filter that claims a covariance
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
 
     def warnings(self) -> list[str]:
@@ -117,17 +118,21 @@ def examine(
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
-    filters, relied_on = [], _relied_on(network)
-    for node, name, item, z in _listening(network, record):
+    filters, outputs, relied_on = [], [], _relied_on(network)
+    for listener in listeners(network, record):
+        node, name, item, z, _ = listener
         advance(f"testing {node}/{name}")
-        white = None if item.claim == "none" or not item.received else whitened_innovations(z, item, inputs)
+        white = None
+        if item.claim != "none" and item.received:
+            white = whitened_innovations(z, item, inputs)
+            outputs += outputs_of(listener, inputs)
         lags = min(LAGS, len(z) // 10)
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
         trusted = name in relied_on.get(node, {name})
         filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test, trusted))
-    return Health(record, links, filters, network.shared)
+    return Health(record, links, filters, outputs, network.shared)
 
 
 def _relied_on(network: Network) -> dict[str, set[str]]:
@@ -142,13 +147,3 @@ def _relied_on(network: Network) -> dict[str, set[str]]:
         claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
         results[node] = fused & set(claims) or {name for name, s in claims.items() if s == max(claims.values())}
     return results
-
-
-def _listening(network: Network, record: Record) -> Iterator[tuple[str, str, AbstractFilter, np.ndarray]]:
-    """Yield every filter with its measurements (time, m): those of the nodes, then central ones."""
-    for node, z in record.measurements.items():
-        for name, item in network.nodes[node].filters.items():
-            yield node, name, item, z
-    for name, fusion in network.fused.items():
-        if isinstance(fusion, AbstractFilter):
-            yield FUSED, name, fusion, np.concatenate(list(record.measurements.values()), axis=1)

@@ -13,6 +13,7 @@ from heliograph.disk.quoting import in_figure, visible
 from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import FilterHealth, Health
+from heliograph.report.outputs import output_numbers
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED
@@ -165,7 +166,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
                     *_not_drawn(_ordered(record)[MOST:], "Their estimates are in the record."),
                 ],
             ),
-            Section("Innovations", _tests(health, drawings)),
+            Section("Innovations", [*_tests(health, drawings), *outputs_table(health)]),
             Section("Links", _health(health, drawings)),
         ],
     )
@@ -265,6 +266,25 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     return [Text([text]), table, *picture, *_not_drawn(left, "Their numbers are in the table.")]
 
 
+def outputs_table(health: Health) -> list[Table]:
+    """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
+    rows = []
+    for item in health.outputs:
+        s = item.summary
+        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if item.weighs else "–"
+        half = (s.bias_high - s.bias_low) / 2
+        name = visible(f"{item.node}/{item.filter}: {item.output}")
+        rows.append([name, f"{s.received} of {s.expected}", doubted, f"{s.bias:.3g} ± {half:.1g}", f"{s.squared:.2f}",
+                     "to blame" if item.outlying else ""])  # fmt: skip
+    caption = (
+        "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
+        "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
+        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its share "
+        "lies above that of the filter's other outputs together, by an interval of the difference."
+    )
+    return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
+
+
 def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     rows = []
     for link in health.links:
@@ -321,6 +341,10 @@ def run_summary(health: Health) -> dict[str, Json]:
                 "p_value": tested_filter.test.p_value,
             }
         filters.setdefault(tested_filter.node, {})[tested_filter.filter] = results
+    # What the innovations say of each output.
+    outputs: dict[str, dict[str, dict[str, Json]]] = {}
+    for output in health.outputs:
+        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.output] = output_numbers(output)
     # Errors, where the truth is known.
     errors: dict[str, dict[str, Json]] = {}
     for item in errors_of(health.record):
@@ -336,6 +360,7 @@ def run_summary(health: Health) -> dict[str, Json]:
         "warnings": health.warnings(),
         "remarks": health.remarks(),
         "filters": filters,
+        "outputs": outputs,
         "errors": errors,
         "links": links,
         "shared": {name: list(nodes) for name, nodes in health.shared.items()},

@@ -91,6 +91,8 @@ def _what(payload: bytes) -> str:
     """Return what came in place of a JSON object."""
     try:
         return f"{shown(json.loads(payload))}, which is no object"
+    except RecursionError:
+        return "brackets nested too deeply"
     except ValueError as error:
         place = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
         return f"{shown(payload)}, which is no JSON{place}"

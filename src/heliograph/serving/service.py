@@ -51,7 +51,8 @@ class OutputWriter:
         n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
         covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
         numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
-        claim = place.claim if numbers else "none"
+        negative = place.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
+        claim = place.claim if numbers and not negative else "none"
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
         if judged is None:
             return results

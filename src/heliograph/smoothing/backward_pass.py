@@ -108,8 +108,11 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
 
     # From the last step, whose smoothed state is the filtered one.
     last = row(steps, -1)
-    rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
     start = last.end(), last.smoothed(last.end())
+    if len(steps.mean) == 1:
+        mean, covariance = estimate_from(last, start[1])
+        return mean[None], covariance[None]
+    rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
     shapes, _ = jax.eval_shape(body, start, row(rows, -1))  # of what runs share, their axis is 1 long
     end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
     _, result = jax.lax.scan(body, end, rows, reverse=True)

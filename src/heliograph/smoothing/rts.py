@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Claim
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.smoothing.backward_pass import stepped
@@ -53,6 +53,8 @@ def rts_smoother(
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     rows, inputs = data_of(filter, z, u)
+    if not len(rows):
+        raise fail("measurements", "at least one row", "none")
     _, steps = stepped(filter, rows, inputs, filter.init(), np.asarray(0))
     estimate = FixedInterval().estimates(steps)
     return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim)

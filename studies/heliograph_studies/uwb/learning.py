@@ -13,7 +13,7 @@ from heliograph_studies.uwb.drives import Drive
 from heliograph_studies.uwb.setting import FREE, SHARES, STARTS, Numbers, filter_of, versions
 
 REFUSED = 1e6  # value of an objective that is no number
-SPREAD = 0.3  # of the logarithm of a number before any drive, about its start
+SPREAD = 0.3  # of the prior of a number's logarithm about its start
 LATENESS, LEVEL = 0.1, 0.05  # s, m: the unit in which lateness and excess are learned, where others have logarithms
 INDEPENDENT = 10  # errors of a drive that count as independent: they change over some ten seconds
 STEP = 1e-3  # of differences of an objective of order 1
@@ -166,7 +166,7 @@ def objective(rule: str, lines: Any, data: Padded) -> Any:
 
 
 def learn(rule: str, drives: Sequence[Drive], iterations: int, progress: Callable[[], None] = lambda: None) -> Numbers:
-    """The numbers of a rule that these drives teach together; those before any drive where there is none."""
+    """The numbers of a rule that these drives teach together; the starting numbers where there is none."""
     if not iterations or not drives:
         return STARTS[rule]
     data = padded(drives)

@@ -39,8 +39,9 @@ class Numbers(NamedTuple):
     quick_time: float = 1.5
 
 
-# Before any drive: a walker changes speed by 0.3 m/s in a second; by their data sheet radios are precise to 2 to 4 cm
-# and accurate to 10 cm; stamps are late by a slot or two.
+# Round numbers: a walker changes speed by 0.3 m/s in a second; by their data sheet radios are precise to 2 to 4 cm and
+# accurate to 10 cm; stamps are late by a slot or two. The form of the rule with memory, its numbers, and the sizes and
+# times of its errors above were chosen with los_a1, los_b3, nlos_a1 and nlos_b4 in view: only other drives test them.
 WALK, LATE, ACCURACY = 0.1, 0.15, 0.1
 STARTS = {
     "plain": Numbers(WALK, 1.0, ACCURACY, LATE),
@@ -51,7 +52,7 @@ STARTS = {
     "contaminated": Numbers(WALK, 0.2, ACCURACY, LATE, 0.05, 5.0),
     "memory": Numbers(WALK, 0.02, ACCURACY / 2, LATE, 0.02, 5.0, ACCURACY),
 }
-"""Numbers of each rule before any drive: a drive alone is read with them, and learning starts from them."""
+"""Starting numbers of each rule: a drive alone is read with them, and learning starts from them."""
 BEST = "memory"  # the rule of this page: contaminated noise, and errors with memory as states
 MOTION = ("q", "sigma", "excess", "late")
 FREE = {
@@ -69,7 +70,7 @@ SHARES = ("contaminated", "memory")  # rules whose first constant is a share
 
 @dataclass(frozen=True)
 class Setting:
-    """recording: folder of the drives. iterations: of learning; 0 reads every drive with the numbers before any."""
+    """recording: folder of the drives. iterations: of learning; 0 reads every drive with the starting numbers."""
 
     recording: File = NO_FILE
     iterations: int = 6

@@ -17,7 +17,7 @@ from heliograph_studies.without_centre.setting import PLANT, RULES, Setting, net
 class Score:
     """One rule: mean over nodes and the second half of the steps of the error's trace, over that of a centre.
 
-    claimed: the same of what the nodes claim. over_best: error over the least possible, at the last step. nees: the
+    claimed: the same of what the nodes claim. over_best: error over the least possible, at the same steps. nees: the
     smallest and largest of the nodes, simulated. over_time: the error at each step.
     """
 
@@ -32,13 +32,17 @@ class Score:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors of the rules in units of a centre's that receives everything, and the graph."""
+    """Errors of the rules in units of a centre's that receives everything, and the graph.
+
+    bound: the least possible over the second half of the steps; best_possible: its mean.
+    """
 
     nodes: int
     neighbours: float
     centre: float
     best_possible: float
     rules: dict[str, Score]
+    bound: Unlisted[np.ndarray]
     positions: Unlisted[dict[str, np.ndarray]]
     edges: Unlisted[dict[str, tuple[str, ...]]]
     sensors: Unlisted[tuple[str, ...]]
@@ -57,10 +61,11 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
         means = float(error[half].mean() / scale), float(claimed[half].mean() / scale)
         ends = min(nees[name].values()), max(nees[name].values())
         claim = net.claims()["n0"][name]
-        rules[name] = Score(claim, *means, float(error[-1] / bound), ends, error / scale, nees[name])
+        rules[name] = Score(claim, *means, float(error[half].mean() / bound.mean()), ends, error / scale, nees[name])
     mean = float(np.mean([len(mine) for mine in near.values()]))
     measuring = tuple(name for name, node in net.nodes.items() if isinstance(node, hg.Node))
-    return Outcome(setting.nodes, mean, scale, bound / scale, rules, places, near, measuring)
+    return Outcome(setting.nodes, mean, scale, float(bound.mean() / scale), rules, bound / scale, places, near,
+                   measuring)  # fmt: skip
 
 
 def centre(net: hg.Network, steps: int) -> float:
@@ -85,11 +90,12 @@ def before_data(net: hg.Network, setting: Setting) -> dict[str, tuple[np.ndarray
     return result
 
 
-def least(net: hg.Network, setting: Setting) -> float:
-    """Mean over the nodes of the trace of the least error possible, for the same arrivals."""
+def least(net: hg.Network, setting: Setting) -> np.ndarray:
+    """Mean over the nodes of the trace of the least error possible, for the same arrivals, after each later step."""
     name = next(iter(RULES))
-    bound = best_possible(net, name, mesh_arrivals(net, name, setting.steps, setting.seed))
-    return float(np.trace(bound, axis1=1, axis2=2).mean())
+    arrived = mesh_arrivals(net, name, setting.steps, setting.seed)
+    bounds = [best_possible(net, name, arrived[:k]) for k in range(setting.steps // 2 + 1, setting.steps + 1)]
+    return np.trace(bounds, axis1=2, axis2=3).mean(axis=1)
 
 
 def simulated(net: hg.Network, setting: Setting) -> Mapping[str, dict[str, float]]:

@@ -17,7 +17,8 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     """A map of the graph by error over claim, and errors over time."""
     curves = [Curve(label, colour, outcome.rules[name].over_time[BEGUN:]) for name, (label, colour) in RULES.items()]
     steps = np.arange(1.0, len(curves[0].values) + 1) + BEGUN
-    bound = Curve("least possible", INK, np.full(len(steps), outcome.best_possible))
+    earlier = np.full(len(steps) - len(outcome.bound), np.nan)
+    bound = Curve("least possible", INK, np.concatenate([earlier, outcome.bound]))
     values = outcome.rules["intersection"].nees_by_node
     return {
         "map": graph_map(outcome.positions, outcome.edges, values, "error over claim (NEES)", outcome.sensors),

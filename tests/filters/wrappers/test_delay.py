@@ -165,6 +165,15 @@ def test_a_constant_delay_is_predicted_over(filters):
         np.testing.assert_allclose(single.covariance, other.covariance, rtol=1e-12, atol=1e-13)
 
 
+def test_a_delay_of_no_step_is_none():
+    item = hg.linear_filter(PLANT, SENSOR, hg.perfect())
+    stream, late = hg.Stream(item), hg.Stream(hg.filters.late_filter(item, 0))
+    for z in (0.1, np.nan, 0.4):
+        expected, result = stream.push([z]), late.push([z])
+        np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-14)
+        np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-14)
+
+
 LATE = [0.5, 0.3, 0.2]  # a relay's own delay
 RELAYS = [
     hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), N, delay=hg.Discrete([0, 1], [0.7, 0.3])),

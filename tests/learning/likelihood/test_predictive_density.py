@@ -123,6 +123,11 @@ def test_only_one_recording_is_compared(rayleigh):
         hg.learning.compare_laws(shorter, shorter)
 
 
+def test_of_no_measurements_there_is_no_density():
+    result = hg.learning.predictive(PLANT, SENSOR, hg.perfect(), np.zeros((0, 1)))
+    assert len(result.log_likelihood) == 0 and len(result.pit) == 0
+
+
 def test_what_remembers_or_is_too_much_is_refused():
     with pytest.raises(ValueError, match="channel of a predictive likelihood: expected one that forgets"):
         link = hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.2, 0.1), 0.1, 0.2)

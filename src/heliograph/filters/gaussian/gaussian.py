@@ -216,11 +216,13 @@ def gaussian_filter(
     (then it is the Kalman filter).
 
     Raises:
-        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+        ValueError: sensor, channel and plant that do not fit, an initial covariance that is none, what is no transform
+            or update.
 
     Source: cubature fusion under amplify-and-forward relays, Section III.
     """
-    rule = Polytope() if update is None else update
+    instance("transform", transform, AbstractTransform, "one such as Cubature()")
+    rule = Polytope() if update is None else instance("update", update, AbstractUpdate, "one such as Polytope()")
     return _build(plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True)
 
 

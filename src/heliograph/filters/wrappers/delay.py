@@ -87,6 +87,8 @@ class LateFilter(AbstractSizedFilter):
         def move(j: jax.Array, base: PyTree) -> PyTree:
             return self._moved(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
 
+        if not self.delay:
+            return self.base.estimate(state.base)
         return self.base.estimate(jax.lax.fori_loop(0, self.delay, move, jax.tree.map(jnp.asarray, state.base)))
 
 

@@ -98,13 +98,13 @@ class DiffusionWeights(AbstractFusion):
         raise fail("fusion by DiffusionWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
-        """Return the rule with its shares in the rows of the graph, zero for the node itself."""
+        """Return the rule with its shares (degree, row) of the graph's rows, zero for the node itself."""
         result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
         if self.given is not None:
             result = np.array([self._row(graph, i) for i in range(len(graph.senders))])
         result[:, 0] = 0.0
         placed: DiffusionWeights = eqx.tree_at(
-            lambda r: (r.shares, r.given), self, (result, None), is_leaf=lambda leaf: leaf is None
+            lambda r: (r.shares, r.given), self, (result.T, None), is_leaf=lambda leaf: leaf is None
         )
         return placed
 
@@ -151,12 +151,13 @@ class FrozenWeights(AbstractFusion):
         raise fail("fusion by FrozenWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
     def placed(self, graph: Graph) -> "FrozenWeights":
-        """Return the rule with the blocks of the graph's rows."""
+        """Return the rule with the blocks (degree, n, degree, n, row) of the graph's rows."""
         width = graph.senders.shape[1]
         if len(self.blocks) != len(graph.nodes) or np.shape(self.blocks)[1] < width:
             raise fail("frozen weights", f"blocks of {len(graph.nodes)} nodes and {width} of each or more",
                        f"shape {np.shape(self.blocks)}")  # fmt: skip
-        return FrozenWeights(self.rule, np.asarray(self.blocks)[graph.senders[:, 0], :width, :, :width])
+        blocks = np.asarray(self.blocks)[graph.senders[:, 0], :width, :, :width]
+        return FrozenWeights(self.rule, np.ascontiguousarray(np.moveaxis(blocks, 0, -1)))
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of what arrived, and the covariance that the blocks give them."""

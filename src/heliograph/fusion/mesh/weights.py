@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.linalg import regular_solve
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import factor, minus
+from heliograph.numerics.small_matrix import add, diagonal_of, factor, identity, minus, symmetric
 from heliograph.numerics.types import Bool, Float
 
 SHORT = 24  # unknowns of equations that are solved side by side, operation by operation
@@ -37,10 +37,7 @@ def arrived_weights(
     return unit[:, None, None] * weights / unit
 
 
-@runs_last
-def _short_solve(
-    a: Float[jax.Array, "n n *#runs"], b: Float[jax.Array, "n k *#runs"]
-) -> Float[jax.Array, "n k *#runs"]:
+def _solved(a: Float[jax.Array, "n n ..."], b: Float[jax.Array, "n ..."]) -> Float[jax.Array, "n ..."]:
     """A^-1 B of a regular A by its Cholesky factor, written out."""
     columns, scales = factor(a)
     n = len(a)
@@ -53,17 +50,51 @@ def _short_solve(
     return jnp.stack(backward)
 
 
+_short_solve = runs_last(_solved)
+
+
 def arrived_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """Diagonal weights of those that are present: the best for each component of the state by itself."""
     degree, n = joint.shape[:2]
-    component = jnp.einsum("iaja->aij", joint)
+    if degree <= SHORT:
+        return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
+    component = jnp.stack([joint[:, a, :, a] for a in range(n)])
 
     def single(item: jax.Array) -> jax.Array:
         return arrived_weights(item.reshape(degree, 1, degree, 1), present)[0, :, 0]
 
     return jnp.einsum("ai,ab->aib", jax.vmap(single)(component), jnp.eye(n))
+
+
+@runs_last
+def component_weights(
+    joint: Float[jax.Array, "degree n degree n *#runs"], present: Bool[jax.Array, "degree *#runs"]
+) -> Float[jax.Array, "degree n *#runs"]:
+    """Diagonals c_i of the weights of each component by itself.
+
+    Of one component, c = U^-1 1 / 1' U^-1 1 over those that are present, by the factor of U, as `arrived_weights`.
+    """
+    degree, n = joint.shape[:2]
+    there = present.astype(joint.dtype)[:, None]
+    # U of all components side by side, with those that are absent apart.
+    component = jnp.stack([joint[:, a, :, a] for a in range(n)], axis=2)
+    # Library sums, which the compiler does not repeat in everything that uses them.
+    mean = jnp.sum(there * diagonal_of(component) / jnp.sum(there, axis=0), axis=0)
+    apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
+    total = there[:, None] * there * component + identity(degree, component) * apart[:, None]
+    solved = _solved(total, there * jnp.ones_like(mean))
+    return solved / jnp.sum(solved, axis=0)
+
+
+@runs_last
+def weighted_by_component(
+    weights: Float[jax.Array, "degree n *#runs"], joint: Float[jax.Array, "degree n degree n *#runs"]
+) -> Float[jax.Array, "n n *#runs"]:
+    """Covariance C P C' of diagonal weights, a sum over senders at a time."""
+    sums = add([joint[:, :, j] * weights[j] for j in range(len(weights))])
+    return symmetric(add([w[:, None] * s for w, s in zip(weights, sums, strict=True)]))
 
 
 def arrived_scalar_weights(

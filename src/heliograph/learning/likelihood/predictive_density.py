@@ -143,7 +143,9 @@ def expected_signals(
 def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
     """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
     y, spread, z = expected
-    blocks = [_block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts) for i in range(0, len(z), ROWS)]
+    blocks = [
+        _block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts) for i in range(0, max(len(z), 1), ROWS)
+    ]
     return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 

@@ -12,6 +12,7 @@ Fates = list[Float[np.ndarray, " packets"]]
 
 JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
 COPY = 50  # a number received again within so many is a copy
+MOST = 2.0**53  # whole numbers up to here are doubles
 
 
 def fates_of_sequence(
@@ -35,6 +36,8 @@ def fates_of_sequence(
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
+    if np.max(np.abs(numbers)) > MOST:
+        raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
     # order by time of sending where it is known
     received = numbers.astype(np.int64)
     if sent is not None:

@@ -19,6 +19,7 @@ from heliograph.planning.paths.model import Paths, PathValues, Powers, at_least,
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120
 DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
+LARGEST = 1e100  # powers and noises, whose squares doubles hold
 
 Hops = Float[np.ndarray, "time path hops"]
 
@@ -71,11 +72,13 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
         The powers, shape (H,).
 
     Raises:
-        ValueError: a negative noise or total, no hops.
+        ValueError: a negative noise or total, no hops, noises or a total whose squares are no numbers.
     """
     noise, power = hop_noises(alpha), float(scalar("total power", total, 0.0))
     if not np.any(noise):
         return np.zeros(len(noise))
+    if power and not 1 / LARGEST <= power <= LARGEST:
+        raise fail("total power", f"0, or a number from {1 / LARGEST:g} to {LARGEST:g}", f"{power:g}")
     unit = np.ones((1, 1))
     return np.asarray(split(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
 
@@ -85,6 +88,8 @@ def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
     noise = at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
     if not len(noise):
         raise fail("alpha of hops", "at least one", "none")
+    if np.max(noise) > LARGEST:
+        raise fail("alpha of hops", f"numbers of at most {LARGEST:g}", f"{np.max(noise):g}")
     return noise
 
 

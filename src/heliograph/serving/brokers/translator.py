@@ -54,7 +54,7 @@ class Translator:
         """
         try:
             content = json.loads(payload[:LONGEST])
-        except ValueError:
+        except (ValueError, RecursionError):
             return [payload]
         if not isinstance(content, dict) or not isinstance(content.get("topic"), str) or "payload" not in content:
             return [payload]

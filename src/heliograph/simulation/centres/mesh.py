@@ -35,13 +35,15 @@ class MeshState(NamedTuple):
     """Estimates of all nodes, the covariances by which they weigh, and what is known before any data.
 
     Shapes: mean (node, n), covariance (node, n, n); joint (node, n, node, n) covariance of all errors, None where the
-    rule does without; plant: mean (n,) and covariance (n, n) of the state.
+    rule does without; plant: mean (n,) and covariance (n, n) of the state; sent (node, n): estimates that were sent
+    last, predicted.
     """
 
     mean: Float[jax.Array, "node n"]
     covariance: Float[jax.Array, "node n n"]
     joint: Float[jax.Array, "node n node n"] | None
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+    sent: Float[jax.Array, "node n"]
 
 
 class Data(NamedTuple):
@@ -98,6 +100,7 @@ class Mesh(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
+    alpha: float | None = eqx.field(static=True)
     needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
@@ -107,7 +110,8 @@ class Mesh(Module):
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
         joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
-        return MeshState(jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1)), joint, (mean, covariance))
+        means = jnp.tile(mean, (nodes, 1))
+        return MeshState(means, jnp.tile(covariance, (nodes, 1, 1)), joint, (mean, covariance), means)
 
     def step(
         self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
@@ -121,7 +125,8 @@ class Mesh(Module):
         # All rounds but the last only intersect.
         mean = state.mean
         for weights in parts.exchanges:
-            mean = mean + self._pulled(weights.front, weights.parts, mean)
+            mean = mean + self._pulled(weights.front, weights.parts, mean, mean)
+        sent = self._sent(mean, state)
         # Innovations about one common prediction, so that no digits of the means themselves are lost.
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)
@@ -131,13 +136,27 @@ class Mesh(Module):
         # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
         innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
         mean = (
-            predicted + self._pulled(gains.front, gains.parts, mean) + jnp.einsum("iab,ib->ia", gains.gain, innovation)
+            predicted
+            + self._pulled(gains.front, gains.parts, mean, sent)
+            + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         )
         # Covariance of all errors where the rule needs it; it is then what is claimed.
         joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
-        after = MeshState(mean, gains.covariance, joint, parts.plant)
+        after = MeshState(mean, gains.covariance, joint, parts.plant, sent @ motion.matrix.T + motion.shift)
         return after, self._by_group(mean, claimed)
+
+    def _sent(self, mean: jax.Array, state: MeshState) -> Float[jax.Array, "node n"]:
+        """Estimates that the neighbours have: those of now, or with events those that were sent last, predicted.
+
+        A node sends where (xhat - xs)' P^-1 (xhat - xs) > alpha n; the error of xs is then at most
+        (1 + sqrt(alpha n))^2 P: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
+        """
+        if self.alpha is None:
+            return mean
+        off = mean - state.sent
+        far = jnp.einsum("ia,iab,ib->i", off, jax.vmap(inverse)(state.covariance), off)
+        return jnp.where(far[:, None] > self.alpha * off.shape[1], mean, state.sent)
 
     def parts(
         self,
@@ -172,10 +191,12 @@ class Mesh(Module):
         return jnp.pad(z, ((0, 0), (0, self.size - z.shape[1])), constant_values=jnp.nan)
 
     def _pulled(
-        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n n"], mean: jax.Array
-    ) -> Float[jax.Array, "node n"]:
-        """front_i sum_j parts_ij (xhat_j - xhat_i)."""
-        off = jnp.einsum("idab,idb->ia", parts, mean[self.senders] - mean[:, None])
+        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n n"],
+        mean: jax.Array, sent: jax.Array,
+    ) -> Float[jax.Array, "node n"]:  # fmt: skip
+        """front_i sum_j parts_ij (xs_j - xhat_i) over the neighbours j of i and what they sent."""
+        away = (sent[self.senders] - mean[:, None]).at[:, 0].set(0.0)
+        off = jnp.einsum("idab,idb->ia", parts, away)
         return jnp.einsum("iab,ib->ia", front, off)
 
     def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
@@ -218,13 +239,16 @@ class Mesh(Module):
     ) -> PyTree:
         """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
         information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
-        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), *[0] * (1 + len(rest))))
+        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (1 + len(rest))))
         results = []
         for part in self.buckets:
             rows, width = part.rows, part.width
             theirs = self.senders[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
             item = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
+            if self.alpha is not None:  # what was sent last errs by more than the estimate
+                wider = np.where(np.arange(width) > 0, (1 + np.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
+                item = item._replace(traces=item.traces * wider, information=item.information / wider[:, None, None])
             results.append(both(part.rule, item, *(leaf[rows] for leaf in rest)))
         if len(results) == 1:
             return results[0]
@@ -345,6 +369,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         counts=tuple(len(names) for names in network.groups),
         places=tuple(mine),
         nodes=graph.nodes,
+        alpha=fusion.alpha,
         size=max(1, *(node.received for node in network.nodes.values())),
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],

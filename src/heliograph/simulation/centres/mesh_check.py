@@ -96,6 +96,13 @@ def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
         raise fail(f"{what} by {kind.__name__}", "with_mean=False", True)
     if fusion.rounds > 1 and (rule.needs_joint or isinstance(rule, FrozenWeights)):
         raise fail(f"{what} by {kind.__name__}", "one round (more need a rule that intersects)", fusion.rounds)
+    # With events no matrix may depend on what is sent, and nothing may get lost.
+    if fusion.alpha is not None and (rule.needs_joint or isinstance(rule, FrozenWeights)):
+        raise fail(f"{what} by {kind.__name__}", "a rule that intersects, where there are events", fusion.alpha)
+    if fusion.alpha is not None and (fusion.rounds > 1 or fusion.link is not None):
+        expected = "one round without losses, where there are events (a lost message looks like one that was not sent)"
+        raise fail(what, expected, f"{fusion.rounds} rounds" if fusion.link is None else "a link")
+    # Information of a singular start has no number.
     start = np.asarray(first(network.plant).initial_covariance)
     scale = np.sqrt(np.diagonal(start))
     singular = np.any(scale == 0) or np.linalg.eigvalsh(start / np.outer(scale, scale))[0] < RANK

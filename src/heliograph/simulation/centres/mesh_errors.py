@@ -102,6 +102,9 @@ def mesh_errors(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), for all pairs of a graph.
     """
     mesh = mesh_named(network, fusion)
+    if mesh.alpha is not None:
+        raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step",
+                   f"alpha {mesh.alpha:g}, by which it depends on data what is sent")  # fmt: skip
     flags = _flags(mesh, arrived)
     network.check_horizon(len(flags))
     u = inputs_of(network, inputs, len(flags))

@@ -76,7 +76,7 @@ def mean_mesh_errors(
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
     rule = item.rule.placed(graph_of(item.neighbours or {}, names))
-    rule = jax.tree.map(lambda leaf: leaf[patterns.node] if eqx.is_array(leaf) else leaf, rule)
+    rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
     part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
     rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
     with jax.enable_x64(True):

@@ -16,7 +16,7 @@ from heliograph.fusion.weights import matrix_weights
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.numerics.check import array, check_count, fail, instance
+from heliograph.numerics.check import array, check_count, fail, function, instance
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
@@ -100,6 +100,7 @@ def relay_tree(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     check_count("degree of a tree", degree, 2)
+    function("node", node, "the numbers of one leaf that returns a Node")
     count, steps = _count(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
         # One leaf stands for the structure of all.
@@ -214,6 +215,6 @@ def _slice(numbers: PyTree, which: int | slice) -> PyTree:
 
 def _count(numbers: PyTree) -> int:
     lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
-    if len(lengths) != 1 or None in lengths:
+    if len(lengths) != 1 or lengths & {None, 0}:
         raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))
     return len(jax.tree.leaves(numbers)[0])

@@ -1,0 +1,98 @@
+"""Innovations of a run, output by output: how many values were down-weighted, their bias, and which output to blame."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.disk.quoting import visible
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.innovation_summary import InnovationSummary, outlying, summarise_innovations
+from heliograph.model.estimate import Innovation
+from heliograph.report.results import Json
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.record import Record
+
+
+class OutputHealth(NamedTuple):
+    """Innovations of one received number under one filter.
+
+    weighs: whether the filter weighs what arrives. outlying: whether more of its values are down-weighted than of the
+    filter's others together, by an interval of the difference.
+    """
+
+    node: str
+    filter: str
+    output: str
+    weighs: bool
+    outlying: bool
+    summary: InnovationSummary
+
+    def __str__(self) -> str:
+        """One line, such as "radio/robust: left: 7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
+        blame = "; to blame: more than of the others" if self.outlying else ""
+        return visible(f"{self.node}/{self.filter}: {self.output}: {self.summary}{blame}")
+
+
+class Listener(NamedTuple):
+    """A filter with its measurements (time, m) and their names."""
+
+    node: str
+    name: str
+    filter: AbstractFilter
+    measurements: np.ndarray
+    outputs: list[str]
+
+
+def listeners(network: Network, record: Record) -> Iterator[Listener]:
+    """Yield every filter with its measurements: those of the nodes, then central ones."""
+    received = record.measurements
+    for node, z in received.items():
+        for name, item in network.nodes[node].filters.items():
+            yield Listener(node, name, item, z, list(network.nodes[node].received_names))
+    every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):
+            yield Listener(FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
+
+
+def weighs(item: AbstractFilter) -> bool:
+    """Ask whether a filter weighs the components of what arrives."""
+    with jax.enable_x64(True):
+        state = jax.tree.map(jnp.asarray, item.init())
+        innovation = jax.eval_shape(lambda before, z: item.correct(before, z)[1], state, np.zeros(item.received))
+    return innovation.weight is not None
+
+
+def outputs_of(listener: Listener, inputs: np.ndarray) -> list[OutputHealth]:
+    """Summarise the innovations of one filter that claims a covariance, by output."""
+    result = listener.filter.run(listener.measurements, inputs)
+    innovation = Innovation(result.innovations, result.innovation_covariances, result.log_likelihoods, result.weights)
+    summaries = summarise_innovations(innovation)
+    outliers, weighed = outlying(summaries), result.weights is not None
+    return [
+        OutputHealth(listener.node, listener.name, name, weighed, weighed and i in outliers, summary)
+        for i, (name, summary) in enumerate(zip(listener.outputs, summaries, strict=True))
+    ]
+
+
+def weighed_outputs(network: Network, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
+    """Summarise the innovations of all filters that weigh what arrives, by output."""
+    chosen = (item for item in listeners(network, record) if item.filter.received and weighs(item.filter))
+    return [output for item in chosen for output in outputs_of(item, inputs)]
+
+
+def output_numbers(item: OutputHealth) -> dict[str, Json]:
+    """Return the numbers of one output for a summary; None where there are none."""
+    summary = item.summary
+    values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
+                                "squared": summary.squared}  # fmt: skip
+    if item.weighs:
+        values |= {"weight": summary.weight, "share": summary.share.estimate, "share_low": summary.share.low,
+                   "share_high": summary.share.high}  # fmt: skip
+    counted: dict[str, Json] = {"expected": summary.expected, "received": summary.received}
+    if item.weighs:
+        counted |= {"down_weighted": summary.down_weighted, "to_blame": item.outlying}
+    return counted | {name: None if np.isnan(value) else value for name, value in values.items()}
