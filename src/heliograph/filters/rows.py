@@ -35,13 +35,13 @@ class Filtered:
             that weighs nothing.
     """
 
-    means: "Float[np.ndarray, 'steps n']"
-    covariances: "Float[np.ndarray, 'steps n n']"
-    innovations: "Float[np.ndarray, 'steps m']"
-    innovation_covariances: "Float[np.ndarray, 'steps m m']"
-    log_likelihoods: "Float[np.ndarray, ' steps']"
+    means: np.ndarray
+    covariances: np.ndarray
+    innovations: np.ndarray
+    innovation_covariances: np.ndarray
+    log_likelihoods: np.ndarray
     claim: Claim
-    weights: "Float[np.ndarray, 'steps m'] | None" = None
+    weights: np.ndarray | None = None
 
     @property
     def log_likelihood(self) -> float:
