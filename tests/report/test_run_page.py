@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.report.errors import errors_of
 from heliograph.report.health import Link, examine
-from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
+from heliograph.report.run_page import errors_table, rounded, run_figures, run_page, run_summary
 from tests.losing import Losing
 
 STEPS = 300
@@ -161,3 +161,38 @@ def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch
     assert (tmp_path / "out.csv").read_text().startswith("time,fused.level,fused.level.sd,fused.valid\n")
     page = (tmp_path / "report" / "report.html").read_text()
     assert "fused: estimates with bands" in page and "fused/centre" in page
+
+
+def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
+    """Behind a gain that is random, the filter that takes its mean is too sure; the network relies on the exact one."""
+    sensor = hg.LinearSensor([[1.0]], 0.1, outputs={"height": "m"})
+    plant = hg.LinearPlant(DRIFT, [[1.0]], [3.0], [[10.0]], states={"level": "m"})
+    hop = hg.hop(hg.Discrete([0.2, 1.8], [0.5, 0.5]), 0.01)
+    filters = {
+        "exact": hg.linear_filter(plant, sensor, hop),
+        "mean": hg.mean_gain_filter(plant, sensor, hop),
+    }
+    network = hg.Network(plant, {"a": hg.Node(sensor, hop, filters)})
+    record = hg.monte_carlo(network, STEPS, 1, key=2)
+    health_ = examine(network, hg.run(network, {"a": record.measurements["a"][0]}), np.zeros((STEPS, 0)))
+    assert health_.warnings() == [] and any("a/mean is too sure" in line for line in health_.remarks())
+    figures = run_figures(health_)
+    assert figures["estimates_0"].axes[0].get_ylabel() == "level (m)"
+    page = run_page(health_, "net", dict.fromkeys(figures, b"<svg/>")).html()
+    fits(page)
+    assert "The recording agrees with the network" in page and "there to be compared with" in page
+    assert "None is missing" in page and "orange" not in page
+
+
+def test_a_doubt_names_its_filter(health):
+    title = run_page(health, "net", dict.fromkeys(run_figures(health), b"<svg/>")).title
+    assert title.endswith(" about the network: a/sure")
+
+
+def test_numbers_are_rounded_by_their_own_error():
+    """Two digits of the standard error, whatever the size of the number."""
+    for value, error, text in [
+        (12.34567, 0.0123, "12.346"), (0.5, 0.2, "0.50"), (1234.5, 130.0, "1230"), (3.14159, 0.0, "3.142"),
+        (np.nan, 1.0, "nan"), (1.0, np.inf, "1"),
+    ]:  # fmt: skip
+        assert rounded(value, error) == text

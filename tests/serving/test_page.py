@@ -12,19 +12,25 @@ import pytest
 from scipy.stats import chi2
 
 pytest.importorskip("uvicorn")
+from heliograph.numerics.unit import NameWithUnit
 from heliograph.serving.page import Door, door, shown
-from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch
+from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch, watch_of
 from tests.serving.watched import Scripted
+from tests.serving.worlds import stepping
 from tests.widths import program
 
 TOKEN = "a token of enough letters"
 
 
 def looked(
-    look: Callable[[str], Awaitable[None]], service: Scripted, rows: int = 300, token: str | None = None
+    look: Callable[[str], Awaitable[None]],
+    service: Scripted,
+    rows: int = 300,
+    token: str | None = None,
+    watch: Watch | None = None,
 ) -> Watch:
     """Look at a page of a service that has taken so many rows."""
-    watch = Watch(["<i>x</i>", "v"])
+    watch = Watch(["<i>x</i>", "v"]) if watch is None else watch
     watch.over(service).take([str(i).encode() for i in range(rows)])
 
     async def work() -> None:
@@ -147,13 +153,64 @@ def test_a_page_of_elsewhere_that_takes_our_name_does_not_get_in():
     looked(look, Scripted())
 
 
+async def drawn(url: str) -> str:
+    """Return a page as a browser has drawn it."""
+    arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--timeout=4000", "--dump-dom", url]
+    browser = await asyncio.create_subprocess_exec(str(program()), *arguments, stdout=-1, stderr=-3)
+    return (await browser.communicate())[0].decode()
+
+
+SENDERS = {
+    "node 1": {"last": 290, "silent": 5, "provisional": 4, "missed": 0, "chance": 1.0, "dead": False},
+    "node 2": {"last": 3, "silent": 292, "provisional": 4, "missed": 9, "chance": 1e-5, "dead": True},
+}
+
+
+def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a_warning():
+    assert watch_of(stepping(), "tank").fused == {"both": ("upper", [("a", "linear"), ("b", "linear")])}
+    parts = [("node 0", "cubature"), ("node 1", "cubature")]
+    for scale, doubted in ((1.0, False), (3.0, True)):
+        watch = Watch(["x", "v"], "tank", "steps", {"both": ("upper", parts)})
+        assert watch.view(None)["tests"] == []  # nothing to judge by yet
+        watch.over(Scripted(scale, nodes=2, senders=SENDERS)).take([str(i).encode() for i in range(300)])
+        view = watch.view(None)
+        fused = view["tests"][-1]
+        assert (fused["node"], fused["filter"], fused["claim"], fused["doubt"]) == ("fused", "both", "upper", doubted)
+        assert fused["by"] == ["node 0/cubature", "node 1/cubature"] and fused["numbers"] == 2 * 600
+        assert view["senders"] == SENDERS
+        dead = "node 2: its sender is dead: 9 heartbeats did not come, by chance once in 100,000"
+        assert [line for line in view["warnings"] if "sender" in line] == [dead]
+
+
+@pytest.mark.real("browser")
+def test_a_browser_draws_axes_with_units_what_is_not_final_and_the_state_of_senders(fits):
+    watch = Watch([NameWithUnit("position", "m"), "v"], "tank", "s")
+
+    async def look(url: str) -> None:
+        await asyncio.to_thread(fits, f"{url}/")
+        text = await drawn(url)
+        assert "<title>tank</title>" in text and 'id="title">tank</h1>' in text and "plant mower" in text
+        assert "<b>position (m)</b>" in text and ">time (s)</text>" in text
+        # sin(299 / 20) = 0.6874 with 2 sqrt(0.04 (1 + 4 / 300)) = 0.4027: two digits of the deviation
+        assert "0.69 ± 0.40 m (two deviations), nominal" in text
+        figure = text[text.index("<svg") : text.index("</svg>")]
+        assert figure.count("<circle") == figure.count('class="bar"') == 4
+        ticks = [float(tick) for tick in re.findall(r'class="tick end"[^>]*>(-?[\d.]+)<', figure)]
+        assert len(ticks) >= 3 and np.allclose(np.diff(ticks), ticks[1] - ticks[0]) and min(ticks) < 0 < max(ticks)
+        (path,) = re.findall(r'class="mean" d="([^"]*)"', figure)
+        assert path.count("L") == 300 - 4 - 1  # the line ends with the last final estimate
+        names = re.findall(r'<th scope="row">(node \d+)</th>', text)
+        assert names == [f"node {i}" for i in range(14)] and '<p id="search" class="choices">' in text
+        assert ">silent for 5 steps</td>" in text and ">dead: 9 heartbeats missed</td>" in text
+
+    looked(look, Scripted(nodes=14, waiting=4, senders=SENDERS), watch=watch)
+
+
 @pytest.mark.real("browser")
 def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside(fits):
     async def look(url: str) -> None:
         await asyncio.to_thread(fits, f"{url}/")
-        arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--timeout=4000", "--dump-dom", url]
-        browser = await asyncio.create_subprocess_exec(str(program()), *arguments, stdout=-1, stderr=-3)
-        text = (await browser.communicate())[0].decode()
+        text = await drawn(url)
         body = text[text.index("<main>") : text.index("</main>")]
         assert body.count("<svg") == 2 and 'class="area"' in body
         assert "&lt;b&gt;node" in body and "&lt;i&gt;x" in body and "<b>node" not in body and "<i>" not in body

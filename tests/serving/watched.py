@@ -24,10 +24,16 @@ class Last:
 
 @dataclass
 class Scripted:
-    """Says that each message, a number, was a row of `plant` with this innovation in units of its claim."""
+    """Says that each message, a number, was a row of `plant` with this innovation in units of its claim.
+
+    The last `waiting` rows of a batch are not final; more nodes than one are `node 0`, `node 1`, ...
+    """
 
     scale: float = 1.0
     plant: str = "mower"
+    nodes: int = 1
+    waiting: int = 0
+    senders: dict[str, dict[str, object]] = field(default_factory=dict)
     plants: dict[str, OnePlant] = field(default_factory=dict)
     malformed: int = 0
     last: Last = field(default_factory=Last)
@@ -44,16 +50,25 @@ class Scripted:
         return []
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
-        link = self.plants.setdefault(self.plant, OnePlant()).links.setdefault("<b>node", Link())
+        names = ["<b>node"] if self.nodes == 1 else [f"node {i}" for i in range(self.nodes)]
+        links = self.plants.setdefault(self.plant, OnePlant()).links
         results = []
         for payload in payloads:
             i = int(payload)
-            link.used += 1
+            for name in names:
+                links.setdefault(name, Link()).used += 1
             nis = self.scale * float(np.random.default_rng(i).chisquare(2))
             covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
             message = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
             message |= {"claim": "nominal", "nis": nis, "received": 2}
-            body = {"id": i, "plant": self.plant, "time": i / 10, "estimates": {"<b>node": {"cubature": message}}}
-            results.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
-            results.append(Output(None, self.plant, "provisional", to_json(body | {"kind": "provisional"})))
+            body = {
+                "id": i,
+                "plant": self.plant,
+                "time": i / 10,
+                "estimates": {name: {"cubature": message} for name in names},
+            }
+            if i < len(payloads) - self.waiting:
+                results.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
+            newest = body | {"kind": "provisional", "senders": self.senders}
+            results.append(Output(None, self.plant, "provisional", to_json(newest)))
         return results

@@ -27,6 +27,9 @@ def serve(
         list[str] | None,
         Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),
     ] = None,
+    accept_changes: Annotated[
+        bool, Parameter(help="Go on from a store whose network has changed, with all that fits.", negative="")
+    ] = False,
     broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, or opc.tcp://host:port.")] = None,
     parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
@@ -52,7 +55,7 @@ def serve(
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import ServiceSettings, run, store_of
+    from heliograph.serving.running import ServiceSettings, name_of, run, store_of
 
     # The schema needs no network.
     if schema:
@@ -76,5 +79,7 @@ def serve(
         page,
         tuple(anew or ()),
         module.get("sources"),
+        name_of(network),
+        accept_changes,
     )
     asyncio.run(run(settings))

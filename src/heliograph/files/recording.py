@@ -14,6 +14,7 @@ from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
+from heliograph.numerics.unit import with_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -88,8 +89,22 @@ def _truth_columns(network: Network) -> dict[str, str]:
     return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
+def _without_units(columns: Mapping[str, np.ndarray], network: Network) -> dict[str, np.ndarray]:
+    """Return columns by name alone, where a header has the unit of its state, input or output: "range (m)"."""
+    received = [name for item in network.nodes.values() for name in item.received_names]
+    known = {with_unit(name): str(name) for name in (*network.states, *network.inputs, *received)}
+    known |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
+    known |= {
+        f"{node}.{with_unit(name)}": f"{node}.{name}"
+        for node, item in network.nodes.items()
+        for name in item.received_names
+    }
+    return {known.get(column, column): values for column, values in columns.items()}
+
+
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
     inputs, received = network.inputs, _received_columns(network)
+    columns = _without_units(columns, network)
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
@@ -133,10 +148,10 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = "".join(f"{part}." for part, used in zip((node, name), several, strict=True) if used)
-            columns += [(prefix + key, values) for key, values in _claims(record.states, estimate)]
+            columns += [(prefix + key, values) for key, values in _claims(record.states, record.units, estimate)]
             later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in later:
-                known = _claims(record.states, later[name])
+                known = _claims(record.states, record.units, later[name])
                 columns += [(f"{prefix}smoothed.{key}", _at_the_end(values, len(record.time))) for key, values in known]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
@@ -159,19 +174,29 @@ def write_estimates(record: Record, path: str | Path) -> None:
     write_table(estimate_columns(record), path)
 
 
-def _claims(states: Sequence[str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+def _headed(name: str, unit: str | None) -> str:
+    """Return the name of a column, with its unit where there is one."""
+    return f"{name} ({unit})" if unit else str(name)
+
+
+def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
     mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     result = []
     for i, state in enumerate(states):
-        result.append((state, mean[:, i]))
+        result.append((_headed(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
             variance = bound[:, i, i]
-            result.append((f"{state}.sd", np.sqrt(np.where(variance >= 0, variance, np.nan))))
+            result.append(
+                (_headed(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
+            )
+    # Covariances of two states have the product of their units.
     if estimate.claim != "none":
         for i, a in enumerate(states):
-            result += [(f"cov.{a}.{states[j]}", bound[:, i, j]) for j in range(i + 1, len(states))]
+            for j in range(i + 1, len(states)):
+                of = " ".join(units[name] for name in (a, states[j]) if name in units)
+                result.append((_headed(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
     return [*result, ("valid", is_sound(estimate))]
 
 

@@ -12,12 +12,12 @@ from typing_extensions import TypeAliasType
 from heliograph.model.of_inputs import MatrixFunction, OfInputs, matrix_of
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
-from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
+from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced
-from heliograph.numerics.types import Array, ArrayLike
+from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
     Matrix,
@@ -102,7 +102,8 @@ class Plant(AbstractPlant):
     `noise` is a covariance, a noise law, or a function of u that returns a covariance (zero-mean Gaussian noise).
     `initial_covariance` is a covariance, or a noise law of x_0 - initial_mean where x_0 is not Gaussian.
     An input named "dt" is filled with the time since the previous row when recorded data has no such column.
-    `circular` names the states that are angles, in radians; f must not mind a full turn more in one of them.
+    `states` and `inputs` are names, or a mapping of names to units: {"position": "m"}. `circular` names the states that
+    are angles, in radians; f must not mind a full turn more in one of them.
 
     Raises:
         ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite,
@@ -123,15 +124,15 @@ class Plant(AbstractPlant):
         noise: NoiseLike | NoiseFunction,
         initial_mean: ArrayLike,
         initial_covariance: NoiseLike,
-        states: Sequence[str] | None = None,
-        inputs: Sequence[str] = (),
+        states: Names | None = None,
+        inputs: Names = (),
         circular: Sequence[str] = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
-        self.inputs = names("input names", inputs, len(items("input names", inputs, "names")), "u")
+        self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
         u = np.zeros(len(self.inputs))
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
@@ -177,8 +178,8 @@ class LinearPlant(AbstractPlant):
         initial_mean: ArrayLike,
         initial_covariance: "NoiseLike",
         input_matrix: "ArrayLike | MatrixFunction | None" = None,
-        states: "Sequence[str] | None" = None,
-        inputs: "Sequence[str] | None" = None,
+        states: "Names | None" = None,
+        inputs: "Names | None" = None,
         circular: "Sequence[str]" = (),
     ):
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
@@ -188,7 +189,7 @@ class LinearPlant(AbstractPlant):
         varies = any(callable(item) for item in (matrix, input_matrix, noise))
         if varies and not inputs:
             raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
-        count = None if inputs is None or not varies else len(items("input names", inputs, "names"))
+        count = None if inputs is None or not varies else len(name_list("input names", inputs))
         entry: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
         if not callable(entry):
             entry = array("input matrix", entry, (n, count))

@@ -13,10 +13,10 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cached
-from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
+from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
@@ -65,7 +65,7 @@ class Sensor(AbstractSensor):
     Args:
         measure: h(x), from (n,) to (outputs,), written with jax.numpy.
         noise: law of v, its covariance (outputs, outputs), or a variance.
-        outputs: names of the outputs.
+        outputs: names of the outputs, or a mapping of names to units.
         circular: names of outputs that are angles in radians; a channel must leave them unchanged (gain 1), but for
             noise and erasures.
 
@@ -83,11 +83,11 @@ class Sensor(AbstractSensor):
         self,
         measure: Callable[[jax.Array], ArrayLike],
         noise: NoiseLike,
-        outputs: Sequence[str] | None = None,
+        outputs: Names | None = None,
         circular: Sequence[str] = (),
     ):
         self.function = function("measure of a sensor", measure, "x")
-        dimension = (components(noise) or 1) if outputs is None else len(items("sensor outputs", outputs, "names"))
+        dimension = (components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
         # A variance alone says nothing of the number of outputs, so the function is asked.
@@ -120,7 +120,7 @@ class LinearSensor(AbstractSensor):
         self,
         matrix: ArrayLike,
         noise: NoiseLike,
-        outputs: Sequence[str] | None = None,
+        outputs: Names | None = None,
         circular: Sequence[str] = (),
     ):
         self.matrix = array("sensor matrix", matrix, ("outputs", "states"))

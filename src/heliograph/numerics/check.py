@@ -1,7 +1,7 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,7 +12,8 @@ import numpy as np
 
 from heliograph.numerics.domain import PROBABILITY, REAL, SIMPLEX, Domain, tell, tell_covariance
 from heliograph.numerics.traced import is_traced
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Names
+from heliograph.numerics.unit import NameWithUnit
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units
@@ -307,11 +308,18 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     return radius
 
 
-def names(name: str, value: Sequence[str] | None, count: int, prefix: str) -> tuple[str, ...]:
-    """Return `count` distinct names; None gives prefix0, prefix1, ..."""
+def name_list(name: str, value: Names) -> list[str]:
+    """Return names as a list; of a mapping, each with its unit."""
+    if isinstance(value, Mapping):
+        return [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
+    return [v if isinstance(v, NameWithUnit) else str(v) for v in items(name, value, "names")]
+
+
+def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str, ...]:
+    """Return `count` distinct names; None gives prefix0, prefix1, ...; a mapping gives each name its unit."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
-    result = tuple(str(v) for v in items(name, value, "names"))
+    result = tuple(name_list(name, value))
     if len(result) != count or len(set(result)) != count:
         raise fail(name, f"{count} distinct names", shown(list(result)))
     return result

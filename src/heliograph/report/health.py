@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import STRENGTH
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
-from heliograph.simulation.network import Network
+from heliograph.simulation.network import Network, claim_at
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
@@ -48,6 +50,7 @@ class FilterHealth:
     claim: str
     white: np.ndarray | None
     test: MemoryTest | None
+    trusted: bool = True  # whether the network relies on it
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,17 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
-        for tested_filter in self.filters:
-            lines += _doubts(tested_filter)
+        for item in self.doubted():
+            lines += _doubts(item)
         return lines
+
+    def doubted(self) -> list[FilterHealth]:
+        """Return the filters that the network relies on and whose claims the recording contradicts."""
+        return [item for item in self.filters if item.trusted and any(_doubts(item))]
+
+    def remarks(self) -> list[str]:
+        """Return one line for each doubt about a filter that is there to be compared with."""
+        return [line for item in self.filters if not item.trusted for line in _doubts(item)]
 
 
 def _doubts(item: FilterHealth) -> Iterator[str]:
@@ -107,7 +118,7 @@ def examine(
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
-    filters, outputs = [], []
+    filters, outputs, relied_on = [], [], _relied_on(network)
     for listener in listeners(network, record):
         node, name, item, z, _ = listener
         advance(f"testing {node}/{name}")
@@ -119,5 +130,20 @@ def examine(
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
-        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test))
+        trusted = name in relied_on.get(node, {name})
+        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test, trusted))
     return Health(record, links, filters, outputs, network.shared)
+
+
+def _relied_on(network: Network) -> dict[str, set[str]]:
+    """Return the filters that the network relies on, by node: those that are fused, else those of the strongest claim.
+
+    A filter with a weaker claim than another of its node, such as one that takes the mean of a random gain for it, is
+    there to be compared with.
+    """
+    fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
+    results = {}
+    for node, place in network.nodes.items():
+        claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
+        results[node] = fused & set(claims) or {name for name, s in claims.items() if s == max(claims.values())}
+    return results

@@ -151,13 +151,13 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     # Warnings are in the title and in the first section.
     return Page(
         kicker="Heliograph run",
-        title=f"{_counted(len(doubts), 'doubt')} about the network"
+        title=f"{_counted(len(doubts), 'doubt')} about the network{_by_name(health)}"
         if doubts
         else "The recording agrees with the network",
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
         + _agreement(health, doubts),
         sections=[
-            Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
+            Section("At a glance", [KeyFigures(keys), *_warned(doubts), *_compared(health)]),
             Section(
                 "Estimates",
                 [
@@ -179,12 +179,22 @@ def errors_table(record: Record) -> list[Table]:
          "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
         for item in errors_of(record)
     ]  # fmt: skip
+    # What the columns are, in words.
     caption = (
         "Root mean square error of each state against the truth in the recording. **NEES**: squared error over the "
         "claimed one, per state: 1 where the claim holds, above 1 too sure."
     )
-    headers = ["filter", "claim", *(visible(f"RMSE of {state}") for state in record.states), "NEES"]
+    headers = [
+        "filter",
+        "claim",
+        *(visible(f"RMSE of {_headed(state, record.units)}") for state in record.states),
+        "NEES",
+    ]
     return [Table(headers, rows, caption)] if rows else []
+
+
+def _headed(state: str, units: Mapping[str, str]) -> str:
+    return f"{state} ({units[state]})" if state in units else state
 
 
 def _agreement(health: Health, doubts: list[str]) -> str:
@@ -209,6 +219,18 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
     return [Points([visible(line) for line in doubts])] if doubts else [Text(["No warnings."])]
 
 
+def _by_name(health: Health) -> str:
+    names = [visible(f"{item.node}/{item.filter}") for item in health.doubted()]
+    return f": {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}" if names else ""
+
+
+def _compared(health: Health) -> list[Text | Points]:
+    """Return what the recording says of filters that are there to be compared with; it is no doubt of the network."""
+    lines = [visible(line) for line in health.remarks()]
+    text = "Of filters that are there to be compared with, on which the network does not rely:"
+    return [Text([text]), Points(lines)] if lines else []
+
+
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
     # One row for each filter: size, correlation and p-value of its innovations.
     rows = []
@@ -224,7 +246,7 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
                     tested_filter.claim,
                     size,
                     f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
-                    f"{test.p_value:.3f}",
+                    "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}",
                 ]
             )
     caption = (
@@ -266,16 +288,35 @@ def outputs_table(health: Health) -> list[Table]:
 def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
     rows = []
     for link in health.links:
-        mean, deviation = (f"{link.values.mean():.4g}", f"{link.values.std():.4g}") if len(link.values) else ("–", "–")
+        mean, deviation = _moments(link.values)
         known = "may be lost" if link.loses else "never lost"
         name = visible(f"{link.node}: {link.component}")
         rows.append([name, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
     headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
-    caption = "When each component arrived (blue, above) and when it did not (orange, below)."
+    came, lost = any(link.arrived.any() for link in health.links), not all(link.arrived.all() for link in health.links)
+    parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
+    caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     left = [f"{link.node}: {link.component}" for link in health.links[3 * MOST :]]
     not_drawn = _not_drawn(left, "Their numbers are in the table.")
     return [Table(headers, rows), *picture, *not_drawn, *shared_text(health.shared)]
+
+
+def _moments(values: np.ndarray) -> tuple[str, str]:
+    """Return mean and deviation of a component, each to two digits of its standard error."""
+    if len(values) < 2:
+        return (f"{values[0]:.4g}" if len(values) else "–"), "–"
+    deviation = float(values.std())
+    error = deviation / len(values) ** 0.5
+    return rounded(float(values.mean()), error), rounded(deviation, error / 2**0.5)
+
+
+def rounded(value: float, error: float) -> str:
+    """Return a number to two digits of its standard error; to four of its own without one."""
+    if not (np.isfinite(value) and 0 < error < np.inf):
+        return f"{value:.4g}"
+    places = 1 - int(np.floor(np.log10(error)))
+    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
 def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
@@ -317,6 +358,7 @@ def run_summary(health: Health) -> dict[str, Json]:
     return {
         "rows": len(health.record.time),
         "warnings": health.warnings(),
+        "remarks": health.remarks(),
         "filters": filters,
         "outputs": outputs,
         "errors": errors,

@@ -158,6 +158,11 @@ class Fleet:
         self._blank = self.pool.take()
         self.pool.start(self._blank, -1.0)
 
+    @property
+    def rows_are_joint(self) -> bool:
+        """Return whether all events of one time form one row."""
+        return self._joint
+
     def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
         """Add a plant, whose continuous time starts at `time`."""
         begun = -1.0 if self.lanes.dt is None else time

@@ -42,6 +42,8 @@ class ServiceSettings:
         page: port, or address and port, of the page.
         anew: names of plants that begin anew.
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
+        name: name of the network on the page.
+        accept_changes: whether the plants of a store whose network has changed go on with what fits.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -57,6 +59,8 @@ class ServiceSettings:
     page: str | None = None
     anew: tuple[str, ...] = ()
     sources: object = None
+    name: str = ""
+    accept_changes: bool = False
 
     def __post_init__(self) -> None:
         if self.snapshot is not None:
@@ -83,10 +87,15 @@ def store_of(network: str, given: str | None, parts: int | None) -> str | None:
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
+    return f"{name_of(network)}.db"
+
+
+def name_of(network: str) -> str:
+    """Return the name of a network: of `my_network.py` or of a module, and of the one among several there."""
     place, _, name = network.rpartition(":")
     file, name = (place, f"-{name}") if name.isidentifier() and place else (network, "")
     stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]
-    return f"{stem}{name}.db"
+    return f"{stem}{name}"
 
 
 async def run(settings: ServiceSettings) -> None:
@@ -112,9 +121,9 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
         yield lambda service: service
         return
     from heliograph.serving.page import door, shown
-    from heliograph.serving.watch import Watch
+    from heliograph.serving.watch import watch_of
 
-    watch = Watch(settings.network.states)
+    watch = watch_of(settings.network, settings.name)
     async with shown(watch, door(settings.page)):
         yield watch.over
 
@@ -146,12 +155,14 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Open the store, with the snapshot and the plants to begin anew, and report its state."""
     if settings.store is None:
         return InMemoryStore()
+    from heliograph.serving.storage.carrying import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)
-    store = Store(settings.store, mine, settings.process)
+    carrier = Carrier(fleet, mine, _say) if settings.accept_changes else None
+    store = Store(settings.store, mine, settings.process, carrier=carrier)
     if settings.snapshot is not None:
-        store.begin_from(str(settings.snapshot), mine)
+        store.begin_from(str(settings.snapshot), mine, carrier)
     store.begin_anew(settings.anew)
     if store.damaged:
         _say(f"store {store.name}: {report_damage(store.damaged)}")

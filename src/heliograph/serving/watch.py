@@ -11,11 +11,15 @@ from prometheus_client import CollectorRegistry, Histogram
 from pydantic_core import from_json
 from scipy.special import gammaincinv
 
+from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
+from heliograph.live.player import TIME_STEP
 from heliograph.model.estimate import Claim
+from heliograph.numerics.unit import unit_of
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.simulation.network import FUSED, Network
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
 FEWEST = 20  # received components before a test is made
@@ -143,24 +147,41 @@ class Serves(Takes, Protocol):
 class Point(NamedTuple):
     """Estimates of a plant at one time: means and standard deviations by node and filter. `number` counts the points.
 
-    A final point comes after the provisional ones of its time, and replaces them.
+    A final point replaces the provisional ones of its time.
     """
 
     number: int
     time: float | str
+    final: bool
     estimates: dict[str, dict[str, dict[str, object]]]
 
 
 class Watch:
-    """Observer of any number of services of one network; a call from another thread waits for the current batch."""
+    """Observer of any number of services of one network; a call from another thread waits for the current batch.
 
-    def __init__(self, states: Sequence[str]):
-        self.states = list(states)
+    Args:
+        states: names of the states; a name with a `unit` has it on the axes.
+        title: name of the network.
+        time_unit: unit of times that are numbers.
+        fused: by the name of a fusion of estimates its claim, and the (node, filter) that it fuses: it has no
+            innovation, so that it is judged by theirs.
+    """
+
+    def __init__(
+        self,
+        states: Sequence[str],
+        title: str = "",
+        time_unit: str = "",
+        fused: Mapping[str, tuple[Claim, Sequence[tuple[str, str]]]] | None = None,
+    ):
+        self.states, self.title, self.time_unit = list(states), title, time_unit
+        self.fused = dict(fused or {})
         self.lock = threading.Lock()
         self.services: list[Serves] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
+        self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
         self._count = 0
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
@@ -201,7 +222,9 @@ class Watch:
             for node, filters in message["estimates"].items()
         }
         points = _newest(self._points, plant, lambda: deque(maxlen=POINTS))
-        points.append(Point(self._count, message["time"], estimates))
+        points.append(Point(self._count, message["time"], message["kind"] == "final", estimates))
+        if message.get("senders"):
+            _newest(self._senders, plant, dict).update(message["senders"])
 
     def plants(self) -> Iterator[tuple[str, Plant]]:
         """Yield all plants of all services."""
@@ -226,28 +249,53 @@ class Watch:
             name = next(reversed(self._points), "") if plant is None else plant
             results = [item for known, item in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
-            tests = self._tests.get(name, {})
+            tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
             names = sorted(known for known, _ in self.plants())
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
+                "title": self.title,
                 "count": len(names),
                 "plants": names[:LISTED],
                 "plant": name,
                 "states": self.states,
+                "units": [unit_of(state) for state in self.states],
+                "time_unit": self.time_unit,
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
                 "links": _added(results),
-                "tests": [_test_row(node, filter_name, test) for (node, filter_name), test in tests.items()],
-                "warnings": list(self._warnings(results, tests))[:WARNINGS],
+                "senders": senders,
+                "tests": [_test_row(*key, test) for key, test in tests.items()] + self._fused_rows(tests),
+                "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": _added(item for _, item in self.plants()),
             }
 
-    def _warnings(self, plants: Sequence[Plant], tests: Mapping[tuple[str, str], RunningNis]) -> Iterator[str]:
+    def _fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
+        """Return the check of each fusion of estimates, by the claims of what it fuses."""
+        rows: list[dict[str, object]] = []
+        for name, (claim, parts) in self.fused.items():
+            known = [(part, tests[part]) for part in parts if part in tests]
+            doubted = ["/".join(part) for part, test in known if test.doubt()]
+            numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
+            local = {"doubt": bool(doubted), "by": doubted or ["/".join(part) for part, _ in known]}
+            rows += [{"node": FUSED, "filter": name, "claim": claim, **numbers, **local}] if known else []
+        return rows
+
+    def _warnings(
+        self,
+        plants: Sequence[Plant],
+        tests: Mapping[tuple[str, str], RunningNis],
+        senders: Mapping[str, Mapping[str, Any]],
+    ) -> Iterator[str]:
+        # Filters that are doubted, senders that are dead, then the nodes' messages.
         for (node, filter_name), test in tests.items():
             if doubt := test.doubt():
                 yield f"{node}/{filter_name}: {doubt}"
+        for node, sender in senders.items():
+            if sender["dead"]:
+                chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
+                yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
         for node, link in _added(plants).items():
             if link["late"]:
                 yield f"{node}: {link['late']} came too late to be used; a longer --window would hold what they change"
@@ -323,4 +371,22 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
 def _test_row(node: str, filter_name: str, item: RunningNis) -> dict[str, object]:
     low, high = item.band()
     numbers = {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
-    return {"node": node, "filter": filter_name, "claim": item.claim, **numbers, "doubt": item.doubt() is not None}
+    return {
+        "node": node,
+        "filter": filter_name,
+        "claim": item.claim,
+        **numbers,
+        "doubt": item.doubt() is not None,
+        "by": [],
+    }
+
+
+def watch_of(network: Network, title: str) -> Watch:
+    """Return the observer of services of a network, whose name is `title`."""
+    claims = network.claims()
+    fused = {
+        name: (claims[FUSED][name], [(node, item.filter) for node in network.nodes_with(item.filter)])
+        for name, item in network.fused.items()
+        if isinstance(item, Fusion)
+    }
+    return Watch(network.states, title, "s" if TIME_STEP in network.inputs else "steps", fused)

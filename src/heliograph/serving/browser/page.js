@@ -3,6 +3,7 @@
 const POINTS = 400;
 const at = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
+const MANY = 12; // rows of a table that can be read without a search
 let points = [], source = null, plant = null, chosen = null, last = null;
 
 function made(tag, text, name) {
@@ -20,7 +21,37 @@ function short(value, digits = 5) {
 }
 
 const seconds = (time) => (typeof time === "string" ? Date.parse(time) / 1000 : time);
-const clock = (time) => (typeof time === "string" ? new Date(time).toLocaleTimeString() : short(time));
+const order = (names) => [...names].sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
+const united = (name, unit) => (unit ? name + " (" + unit + ")" : name);
+
+// A value and two deviations, both to two digits of the deviation.
+function rounded(mean, wide) {
+  if (mean === null || !Number.isFinite(mean)) return ["none", "none"];
+  if (!wide) return [short(mean), ""];
+  const places = 1 - Math.floor(Math.log10(wide));
+  if (places > 12 || places < -12 || Math.abs(mean) >= 1e9) return [short(mean), short(wide, 2)];
+  const cut = (value) => (places >= 0 ? value.toFixed(places) : (Math.round(value * 10 ** places) / 10 ** places).toFixed(0));
+  return [cut(mean), cut(wide)];
+}
+
+// Ticks at 1, 2 or 5 times a power of ten, and the decimals that they need.
+function ticks(low, high, count) {
+  const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((n) => n * power).find((size) => size >= raw * 0.999);
+  const from = Math.ceil(low / step - 1e-9), to = Math.floor(high / step + 1e-9);
+  const digits = Math.min(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)), 12);
+  const text = (value) => (Math.abs(value) >= 1e6 || digits > 6 ? short(value) : value.toFixed(digits));
+  return Array.from({ length: Math.max(0, to - from + 1) }, (_, i) => (from + i) * step).map((value) => [value, text(value)]);
+}
+
+function timeTicks(row, from, to, count) {
+  if (typeof row[0].time !== "string") return ticks(from, to, count);
+  const span = to - from, sizes = [0.1, 0.5, 1, 5, 10, 30, 60, 300, 600, 1800, 3600, 10800, 21600, 43200, 86400, 604800];
+  const step = sizes.find((size) => size >= span / count) || span / count;
+  const text = (time) => (step >= 86400 ? new Date(time * 1000).toLocaleDateString() : new Date(time * 1000).toLocaleTimeString());
+  const start = Math.ceil(from / step), number = Math.floor(to / step) - start + 1;
+  return Array.from({ length: Math.max(0, number) }, (_, i) => (start + i) * step).map((time) => [time, text(time)]);
+}
 
 function connect() {
   if (source) source.close();
@@ -48,9 +79,14 @@ function choose(select, options, value, change) {
 
 function show(view) {
   last = view;
-  const newest = new Map((view.since ? points.concat(view.points) : view.points).map((point) => [point.time, point]));
+  const newest = new Map();
+  for (const point of view.since ? points.concat(view.points) : view.points)
+    if (point.final || !(newest.get(point.time) || point).final) newest.set(point.time, point);
   points = [...newest.values()].sort((a, b) => seconds(a.time) - seconds(b.time)).slice(-POINTS);
-  at("title").textContent = view.plant || (view.plants.length ? "estimates" : "waiting for messages");
+  const name = view.title || view.plant || "heliograph";
+  at("title").textContent = document.title = name;
+  at("which").textContent = view.plants.length ? (view.plant && view.title ? "plant " + view.plant : "") : "waiting for messages";
+  at("which").hidden = !at("which").textContent || view.plants.length > 1;
   choose(at("plant"), view.plants, view.plant, (name) => { plant = name; connect(); });
   at("warnings").replaceChildren(...view.warnings.map((text) => made("li", text)));
   keys(view);
@@ -75,42 +111,74 @@ function keys(view) {
 function charts(view) {
   if (!points.length) return at("charts").replaceChildren();
   const newest = points[points.length - 1].estimates;
-  const names = Object.entries(newest).flatMap(([node, filters]) => Object.keys(filters).map((name) => node + "/" + name));
-  if (!names.includes(chosen)) chosen = names[0];
+  const pairs = new Map(order(Object.keys(newest)).flatMap((node) => order(Object.keys(newest[node])).map((name) => [node + "/" + name, [node, name]])));
+  const names = [...pairs.keys()];
+  const first = names.find((name) => name.startsWith("fused/")) || names[0];
+  if (!pairs.has(chosen)) chosen = first;
   choose(at("filter"), names, chosen, (name) => { chosen = name; charts(last); });
-  const cut = names.find((name) => name === chosen);
-  const [node, filter] = Object.entries(newest).flatMap(([n, fs]) => Object.keys(fs).map((f) => [n, f])).find(([n, f]) => n + "/" + f === cut);
-  at("charts").replaceChildren(...view.states.map((state, i) => chart(state, points.map((point) => {
+  const [node, filter] = pairs.get(chosen);
+  // What may still change is not joined to what is final, and what became final since is not drawn twice.
+  const end = Math.max(...points.filter((point) => point.final).map((point) => seconds(point.time)));
+  const drawn = points.filter((point) => point.final || !(seconds(point.time) <= end));
+  at("charts").replaceChildren(...view.states.map((state, i) => chart(state, view.units[i], view.time_unit, drawn.map((point) => {
     const estimate = point.estimates[node] && point.estimates[node][filter];
-    return estimate ? { time: point.time, mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0, claim: estimate.claim } : null;
+    return estimate ? { time: point.time, final: point.final, mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0, claim: estimate.claim } : null;
   }).filter((one) => one && Number.isFinite(one.mean)))));
 }
 
-function chart(name, row) {
+function drawing(width, height) {
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", "0 0 " + width + " " + height);
+  svg.setAttribute("role", "img");
+  const add = (tag, name, values, text) => {
+    const one = document.createElementNS(SVG, tag);
+    one.setAttribute("class", name);
+    for (const [key, value] of Object.entries(values)) one.setAttribute(key, typeof value === "number" ? value.toFixed(1) : value);
+    if (text !== undefined) one.textContent = text;
+    svg.append(one);
+  };
+  return [svg, add];
+}
+
+function chart(name, unit, timeUnit, row) {
   const figure = made("figure"), caption = made("figcaption");
-  caption.append(made("b", name));
+  caption.append(made("b", united(name, unit)));
   figure.append(caption);
   if (!row.length) return figure;
-  const end = row[row.length - 1];
-  caption.append(made("span", short(end.mean) + (end.wide ? " ± " + short(end.wide) : "") + ", " + end.claim));
-  const from = seconds(row[0].time), to = Math.max(seconds(end.time), from + 1e-9);
-  const low = Math.min(...row.map((p) => p.mean - p.wide)), high = Math.max(...row.map((p) => p.mean + p.wide));
-  const room = (high - low) * 0.06 || 1;
-  const x = (p) => (1000 * (seconds(p.time) - from) / (to - from)).toFixed(1);
-  const y = (value) => (300 * (high + room - value) / (high - low + 2 * room)).toFixed(1);
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", "0 0 1000 300");
-  svg.setAttribute("preserveAspectRatio", "none");
-  svg.setAttribute("role", "img");
-  svg.setAttribute("aria-label", name + " over time, now " + short(end.mean));
-  const path = (name, d) => { const one = document.createElementNS(SVG, "path"); one.setAttribute("class", name); one.setAttribute("d", d); svg.append(one); };
-  const line = (of) => of.map(([a, b], i) => (i ? "L" : "M") + a + " " + b).join("");
-  if (row.some((p) => p.wide))
-    path("area", line([...row.map((p) => [x(p), y(p.mean + p.wide)]), ...row.slice().reverse().map((p) => [x(p), y(p.mean - p.wide)])]) + "Z");
-  path("mean", line(row.map((p) => [x(p), y(p.mean)])));
-  const ends = made("div", undefined, "ends");
-  ends.append(made("span", clock(row[0].time)), made("span", short(low) + " to " + short(high)), made("span", clock(end.time)));
-  figure.append(svg, ends);
+  const end = row[row.length - 1], [mean, wide] = rounded(end.mean, end.wide);
+  const tail = unit ? " " + unit : "";
+  caption.append(made("span", mean + (wide ? " ± " + wide : "") + tail + (wide ? " (two deviations), " : ", ") + end.claim));
+  const ranges = row.map((p) => [p.mean - p.wide, p.mean + p.wide]);
+  let low = Math.min(...ranges.map((r) => r[0])), high = Math.max(...ranges.map((r) => r[1]));
+  const room = (high - low) * 0.06 || Math.abs(high) * 0.1 || 1;
+  [low, high] = [low - room, high + room];
+  let from = seconds(row[0].time), to = seconds(end.time);
+  if (to === from) [from, to] = [from - 1, to + 1];
+  // Sizes in pixels, so that text keeps its shape.
+  const width = Math.max(260, at("charts").clientWidth < 760 ? at("charts").clientWidth : (at("charts").clientWidth - 20) / 2);
+  const left = 62, right = width - 14, top = 8, bottom = 150;
+  const x = (time) => left + (right - left) * (time - from) / (to - from), y = (value) => top + (bottom - top) * (high - value) / (high - low);
+  const [svg, add] = drawing(width, 188);
+  svg.setAttribute("aria-label", united(name, unit) + " over time, now " + mean + (wide ? " ± " + wide + " (two deviations)" : ""));
+  for (const [value, text] of ticks(low, high, 4)) {
+    add("line", "grid", { x1: left, x2: right, y1: y(value), y2: y(value) });
+    add("text", "tick end", { x: left - 6, y: y(value) + 4 }, text);
+  }
+  for (const [time, text] of timeTicks(row, from, to, width < 420 ? 3 : 4)) {
+    add("line", "grid", { x1: x(time), x2: x(time), y1: top, y2: bottom });
+    add("text", "tick middle", { x: Math.min(x(time), right - 16), y: bottom + 16 }, text);
+  }
+  add("text", "tick end", { x: right, y: bottom + 32 }, typeof end.time === "string" ? "time of day" : united("time", timeUnit));
+  const line = (of) => of.map(([a, b], i) => (i ? "L" : "M") + a.toFixed(1) + " " + b.toFixed(1)).join("");
+  const final = row.filter((p) => p.final), edge = (side) => (p) => [x(seconds(p.time)), y(p.mean + side * p.wide)];
+  if (final.some((p) => p.wide)) add("path", "area", { d: line([...final.map(edge(1)), ...final.slice().reverse().map(edge(-1))]) + "Z" });
+  if (final.length) add("path", "mean", { d: line(final.map(edge(0))) });
+  for (const p of row.filter((one) => !one.final)) {
+    const [cx, cy] = edge(0)(p);
+    if (p.wide) add("line", "bar", { x1: cx, x2: cx, y1: edge(1)(p)[1], y2: edge(-1)(p)[1] });
+    add("circle", "dot", { cx, cy, r: 2.5 });
+  }
+  figure.append(svg);
   return figure;
 }
 
@@ -121,21 +189,47 @@ function row(name, cells) {
   return one;
 }
 
+// Nodes in the order of their names; of many, those that the search names.
+function searched(view) {
+  const nodes = order(new Set([...Object.keys(view.links), ...Object.keys(view.senders), ...view.tests.map((test) => test.node)]));
+  at("search").hidden = nodes.length <= MANY;
+  const text = at("search").hidden ? "" : at("wanted").value.trim().toLowerCase();
+  const some = nodes.filter((node) => node.toLowerCase().includes(text));
+  at("found").textContent = text ? some.length + " of " + nodes.length + " nodes" : nodes.length + " nodes";
+  return some;
+}
+
+function status_of(sender) {
+  if (!sender) return made("td", "");
+  if (sender.dead) return made("td", "dead: " + sender.missed + " heartbeats missed", "doubt");
+  if (sender.last === null) return made("td", "nothing yet");
+  return made("td", sender.silent ? "silent for " + sender.silent + (sender.silent === 1 ? " step" : " steps") : "sends", "fine");
+}
+
 function links(view) {
-  at("links").replaceChildren(...Object.entries(view.links).map(([node, link]) => {
+  const deciding = Object.keys(view.senders).length > 0, some = searched(view);
+  at("sender").hidden = !deciding;
+  at("links").replaceChildren(...some.filter((node) => view.links[node] || view.senders[node]).map((node) => {
+    const link = view.links[node] || { used: 0, lost: 0, late: 0, duplicate: 0 };
     const own = view.tests.filter((test) => test.node === node);
     const doubted = own.some((test) => test.doubt);
     const judged = made("td", own.length ? (doubted ? "doubtful" : "hold") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
-    return row(node, [...counts.map((n) => n.toLocaleString("en")), judged]);
+    return row(node, [...counts.map((n) => n.toLocaleString("en")), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
   }));
 }
 
 function tests(view) {
-  at("tests").replaceChildren(...view.tests.map((test) => row(test.node + "/" + test.filter, [test.claim,
-    made("td", short(test.ratio, 3), test.doubt ? "doubt" : "fine"), short(test.low, 2) + " to " + short(test.high, 3)])));
+  const some = new Map(searched(view).map((node, i) => [node, node === "fused" ? -1 : i]));
+  const rows = view.tests.filter((test) => some.has(test.node)).sort((a, b) => some.get(a.node) - some.get(b.node) || a.filter.localeCompare(b.filter));
+  at("tests").replaceChildren(...rows.map((test) => row(test.node + "/" + test.filter, [test.claim, ...(test.by.length
+    ? [made("td", test.doubt ? "doubtful" : "holds", test.doubt ? "doubt" : "fine"), "by " + listed(test.by)]
+    : [made("td", test.ratio < 0.1 || test.ratio > 99 ? short(test.ratio, 2) : test.ratio.toFixed(2), test.doubt ? "doubt" : "fine"), short(test.low, 2) + " to " + short(test.high, 3)])])));
 }
 
+const listed = (names) => names.slice(0, 3).join(", ") + (names.length > 3 ? " and " + (names.length - 3) + " more" : "");
+at("wanted").oninput = () => { if (last) { links(last); tests(last); } };
+window.addEventListener("resize", () => { if (last) charts(last); });
 const first = JSON.parse(at("first").textContent);
 if (first.points.length) show(first);
 connect();

@@ -28,10 +28,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliograph.live.identity import Identity, check_same
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
+from heliograph.serving.storage.carrying import DESCRIPTION, Carrier
 from heliograph.serving.storage.database import engine_at
 from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
 
-LAYOUT = "2"  # of these tables; those of layout 1 had no checksums
+LAYOUT = "3"  # of these tables; those of layout 1 had no checksums, of 2 no description of the network
+LAYOUT_KEY = "layout of the store"
 TABLES = MetaData()
 PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
                Column("body", LargeBinary), Column("checksum", BigInteger))  # fmt: skip
@@ -82,10 +84,11 @@ class Store:
 
     Args:
         place: a path, or a URL of PostgreSQL.
-        mine: identity of the network, which a stored state must agree with (`identity`).
+        mine: identity of the network, which a stored state must agree with (`identity`); None opens any.
         process: name of this process in the journal; empty if there is only one.
         journal: number of outputs that the journal keeps at least (default 100,000).
         opened: a store open on the same place, which has already looked for damage.
+        carrier: carries the plants of another network over; None refuses these.
 
     Raises:
         ValueError: a place that cannot be opened; a database that is damaged as a whole; the state of another network,
@@ -95,19 +98,33 @@ class Store:
     keeps = True
 
     def __init__(
-        self, place: str, mine: Identity, process: str = "", journal: int = 100_000, opened: "Store | None" = None
+        self,
+        place: str,
+        mine: Identity | None,
+        process: str = "",
+        journal: int = 100_000,
+        opened: "Store | None" = None,
+        carrier: Carrier | None = None,
     ):
         self.process, self.journal = process, journal
         self._engine = engine_at(place)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
-        mine = table("identity of a store", mine, "texts") | {"layout of the store": LAYOUT}
+        anything = mine is None
+        mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:
             with self._saying("a database that can be written"):
-                check_same(f"store {self.name}", mine, self._stored_identity(mine))
+                self.identity = self._stored_identity(mine)
+                # Of a network that may differ the tables alone have to be the same.
+                mine, other = (_compared(item) for item in (mine or self.identity, self.identity))
+                if carrier is not None or anything:
+                    mine, other = {LAYOUT_KEY: LAYOUT}, {LAYOUT_KEY: other.get(LAYOUT_KEY, "")}
+                check_same(f"store {self.name}", mine, other)
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
+                if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
+                    self.carry(carrier, f"store {self.name}", self.identity)
         except InputError as error:
             self.close()
-            raise InputError(f"{error}; to begin anew, name another") from None
+            raise InputError(f"{error}; to begin anew, name another; --accept-changes goes on with what fits") from None
 
     @contextmanager
     def _saying(self, expected: str) -> Iterator[None]:
@@ -120,7 +137,7 @@ class Store:
             said = getattr(error, "orig", None) or type(error).__name__
             raise fail(f"store {self.name}", expected, str(said)) from None
 
-    def _stored_identity(self, mine: Identity) -> Identity:
+    def _stored_identity(self, mine: Identity | None) -> Identity:
         """Return the identity that the store was made with; a new store takes `mine`."""
         # All tables are there, or none: a store with some missing is damaged.
         there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
@@ -135,13 +152,15 @@ class Store:
             if stored is None:
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
                     raise self._broken("no network that it is of")
+                if mine is None:
+                    raise fail(f"store {self.name}", "plants to begin from", "an empty one")
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
                 return mine
         try:
             result = dict(json.loads(stored))
         except (ValueError, TypeError):
             raise self._broken("no network that it is of") from None
-        return {"layout of the store": "1"} | result
+        return {LAYOUT_KEY: "1"} | result
 
     def _damaged(self) -> dict[str, Damage]:
         """Return the plants with damaged rows, by name."""
@@ -271,9 +290,24 @@ class Store:
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
 
-    def begin_from(self, place: str, mine: Identity) -> None:
-        """Copy the plants of another store, which is not changed."""
-        other = Store(place, mine)
+    def carry(self, carrier: Carrier, what: str, stored: Identity) -> None:
+        """Carry all plants, which are of the network with the identity `stored`, over to the carrier's network."""
+        carrier.begin(what, stored)
+        mine = carrier.mine | {LAYOUT_KEY: LAYOUT}
+        with self._engine.begin() as connection:
+            names = [name for (name,) in connection.execute(select(PLANTS.c.name)) if name not in self.damaged]
+            for i in range(0, len(names), AT_ONCE):
+                rows = {row[0]: row[1:3] for row in _of(connection, list(PLANTS.c), names[i : i + AT_ONCE])}
+                bodies = carrier.carried({name: body for name, (_, body) in rows.items()})
+                after = [_row(PLANTS, name, rows[name][0] + 1, body) for name, body in bodies.items()]
+                self._put(connection, PLANTS, after)
+            this = IDENTITY_TABLE.c.name == IDENTITY
+            connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
+        self.identity = mine
+
+    def begin_from(self, place: str, mine: Identity, carrier: Carrier | None = None) -> None:
+        """Copy the plants of another store, which is not changed; those of another network by a carrier."""
+        other = Store(place, mine if carrier is None else None)
         saying = self._saying(f"a database that takes the plants of {other.name}")
         with saying, self._engine.begin() as here, other._engine.connect() as there:
             if here.execute(select(func.count()).select_from(PLANTS)).scalar():
@@ -282,6 +316,8 @@ class Store:
                 here.execute(PLANTS.insert(), [dict(row) for row in part])
         self.damaged = other.damaged
         other.close()
+        if carrier is not None and other.identity != self.identity:
+            self.carry(carrier, f"store {other.name}", other.identity)
 
     def count(self) -> int:
         """Return the number of stored plants."""
@@ -327,3 +363,8 @@ def _row(table: Table, *values: Any) -> dict[str, object]:
 def _output(line: str) -> Output:
     parts = json.loads(line)
     return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())
+
+
+def _compared(identity: Identity) -> Identity:
+    """Return an identity without the description, of which the other parts are hashes."""
+    return {name: value for name, value in identity.items() if name != DESCRIPTION}

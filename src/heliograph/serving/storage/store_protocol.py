@@ -7,6 +7,7 @@ from heliograph.live.identity import Identity, network_identity
 from heliograph.numerics.check import instance
 from heliograph.serving.fleet import Fleet
 from heliograph.serving.output import Kind, Output
+from heliograph.serving.storage.carrying import DESCRIPTION, description
 
 
 class StoredPlant(NamedTuple):
@@ -83,7 +84,9 @@ def identity(fleet: Fleet) -> Identity:
         fleet: the fleet whose plants the store keeps.
     """
     instance("fleet", fleet, Fleet, "a Fleet")
-    return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict())
+    return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict()) | {
+        DESCRIPTION: description(fleet)
+    }
 
 
 class InMemoryStore:

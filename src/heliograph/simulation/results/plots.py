@@ -8,6 +8,10 @@ import numpy as np
 from heliograph.disk.quoting import in_figure
 from heliograph.numerics.check import check_count, fail
 
+# Okabe and Ito's palette, which people with colour blindness can tell apart; then grey.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b05c92", "#e69f00", "#66727f")
+FAR = 10.0  # times the best filter's error: from there an axis is logarithmic
+
 if TYPE_CHECKING:  # an extra
     from matplotlib.axes import Axes
 
@@ -45,7 +49,7 @@ def plot_record(
         if record.truth is not None:
             item.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
         item.set_ylabel(_with_unit(record.states[i], record.units))
-    drawn[0].legend(frameon=False)
+    _legend_outside(drawn[0])
     return drawn
 
 
@@ -69,7 +73,10 @@ def plot_statistics(
             single.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
             single.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
         single.set_ylabel(f"RMSE of {_with_unit(result.states[i], result.units)}")
-    drawn[0].legend(frameon=False, title="dashed: claimed")
+        ends = [float(np.sqrt(result[node][name].actual()[-1, i, i])) for name in filters]
+        if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
+            single.set_yscale("log")
+    _legend_outside(drawn[0], "dashed: claimed")
     return drawn
 
 
@@ -114,11 +121,14 @@ def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) 
     return result
 
 
-def _colour(number: int) -> str:
-    """Next of the user's colours."""
-    from matplotlib.colors import to_hex
+def _legend_outside(axes: "Axes", title: str | None = None) -> None:
+    """Place the legend to the right of the axes, where it hides no data."""
+    axes.legend(frameon=False, title=title, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    return to_hex(f"C{number % 10}")
+
+def _colour(number: int) -> str:
+    """Next of the colours of all pages."""
+    return COLOURS[number % len(COLOURS)]
 
 
 def _with_unit(name: str, units: Mapping[str, str]) -> str:

@@ -11,6 +11,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.readable import readable
+from heliograph.numerics.unit import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees
@@ -57,7 +58,7 @@ class Record(Saved):
         measurements: by node, (run, time, received), NaN where nothing arrived.
         estimates: by node and filter, with mean (run, time, n), covariance (run, time, n, n) and the claim.
         uplinks: by name, of each fusion that has quantizers.
-        units: by the state's name, and of "time"; empty where they were not given.
+        units: by the state's name, and of "time"; by default those that the names of states have.
         smoothed: record of estimates given later data too; None where these were not asked for. It is saved separately.
         reports: by fusion and node, of each fusion that uses reports.
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
@@ -74,6 +75,11 @@ class Record(Saved):
     smoothed: "Record | None" = None
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Take the units of states whose names have one; units given apart come first."""
+        if isinstance(self.states, tuple) and (units := units_in(self.states)):
+            object.__setattr__(self, "units", units | self.units)
 
     @property
     def runs(self) -> int | None:

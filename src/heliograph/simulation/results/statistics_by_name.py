@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
+from heliograph.numerics.unit import units_in
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.labelled import (
     TIME,
@@ -45,7 +46,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
     Args:
         result: statistics by node and filter.
         states: names of the plant's states.
-        units: by the state's name; none by default.
+        units: by the state's name; by default those that the names have.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         units: Mapping[str, str] | None = None,
     ):
         super().__init__(result)
-        self.states, self.units = states, dict(units or {})
+        self.states, self.units = states, units_in(states) | dict(units or {})
         self.smoothed: StatisticsByName | None = None
 
     def to_xarray(self) -> "xr.Dataset":
