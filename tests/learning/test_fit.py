@@ -172,7 +172,7 @@ def test_a_ridge_is_told_before_the_data():
         (network, np.full((STEPS, 2), np.nan), "at least 40 numbers that arrived for 4 free ones, got 0"),
         (network, [], "recordings: expected at least one, got none"),
         (network, {"other": np.zeros((STEPS, 2))}, r"measurements of the nodes \['node'\], got \['other'\]"),
-        (network, np.zeros((STEPS, 3)), r"measurements of 'node': expected shape \(any, 2\)"),
+        (network, np.zeros((STEPS, 3)), r"measurements of 'node': expected shape \(rows, 2\)"),
     ],
 )
 def test_recordings_that_cannot_be_learned_from(build, data, message):

@@ -96,7 +96,7 @@ def test_gradients_are_finite_differences(name):
 @pytest.mark.parametrize(
     ("measurements", "inputs", "message"),
     [
-        (np.zeros((STEPS, 3)), INPUTS, r"measurements: expected shape \(any, 2\), got shape \(6, 3\)"),
+        (np.zeros((STEPS, 3)), INPUTS, r"measurements: expected shape \(rows, 2\), got shape \(6, 3\)"),
         (np.full((STEPS, 2), np.inf), INPUTS, "measurements: expected finite numbers"),
         (data(True), None, r"inputs: expected shape \(6, 1\)"),
         (data(True), np.full((STEPS, 1), np.nan), "inputs: expected finite numbers"),

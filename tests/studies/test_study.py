@@ -126,6 +126,8 @@ def test_other_numbers_by_name():
     assert (setting.seed, setting.exact, setting.noise.mean, setting.noise.values) == (4, False, 0.3, (3.0, 4.0))
     assert setting.noise.pairs == ((1, 1), (2, 2))
     assert dict(leaves(setting))["noise.values"] == (3.0, 4.0)
+    law = with_values(Setting(), {"noise.law.values": "2"}).noise.law
+    np.testing.assert_array_equal(law.values, [2.0])
     moved = with_values(Setting(matrix=np.eye(2)), {"matrix": "1,2,3,4"})
     np.testing.assert_array_equal(moved.matrix, [[1.0, 2.0], [3.0, 4.0]])
 
@@ -142,7 +144,6 @@ def test_other_numbers_by_name():
         ("noise.values", "1", "--set noise.values: expected 2 numbers separated by commas, got '1'"),
         ("noise.values", "1,x", "--set noise.values: expected 2 numbers separated by commas, got '1,x'"),
         ("noise.pairs", "1,2,3,4.5", "--set noise.pairs: expected 4 numbers separated by commas, got '1,2,3,4.5'"),
-        ("noise.law.values", "2", "--set noise.law.values: expected a Discrete that is set in Python, got '2'"),
         ("plant", "1", "--set plant: expected a number; what is none is set in Python, got '1'"),
     ],
 )
@@ -150,6 +151,12 @@ def test_bad_numbers_are_refused_in_a_line(name, text, words):
     with pytest.raises(ValueError, match=words) as refused:
         with_values(Setting(), {name: text})
     assert "\n" not in str(refused.value)
+
+
+def test_an_object_that_is_made_of_other_arguments_than_it_holds_is_set_in_python():
+    plant = hg.LinearPlant([[0.5]], [[1.0]], [0.0], [[1.0]])
+    with pytest.raises(ValueError, match="--set plant.matrix: expected a LinearPlant that is set in Python, got '2'"):
+        with_values(Setting(plant=plant), {"plant.matrix": "2"})
 
 
 def test_what_tells_settings_apart():

@@ -15,6 +15,7 @@ from heliograph.disk.output_file import check_output
 from heliograph.disk.whole_file import whole_file
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import fail, instance, text
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.results.record import Record
 
@@ -25,6 +26,7 @@ ODOMETRY, NUMBER = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
 State = TypeAliasType("State", str | None)  # of a state of the plant, if it is there
 
 
+@readable
 @dataclass(frozen=True)
 class Pose:
     """States that are the pose and the twist of an odometry message, by name; an axis without a state stays at 0.

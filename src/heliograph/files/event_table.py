@@ -10,6 +10,7 @@ from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.network import Network
 
@@ -36,6 +37,7 @@ class Columns:
         return np.array(self.values).reshape(len(self.time), self.size)
 
 
+@readable
 class EventTable:
     """Events of a network, read from messages of a recording, each with the time when it was measured and when logged.
 

@@ -17,6 +17,7 @@ from heliograph.files.recording import TIME_STEP
 from heliograph.live.event import INPUTS, whole
 from heliograph.numerics.check import fail, scalar, shown, text
 from heliograph.numerics.dates import UNITS, dates, instant
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 
@@ -26,6 +27,7 @@ PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
 NUMBER = "a number, true or false, or null for what did not arrive"
 
 
+@readable
 @dataclass(frozen=True)
 class Source:
     """One event of a node in each message of a topic, as `json_field` describes it.

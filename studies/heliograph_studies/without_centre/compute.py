@@ -95,7 +95,7 @@ def least(net: hg.Network, setting: Setting) -> np.ndarray:
     name = next(iter(RULES))
     arrived = mesh_arrivals(net, name, setting.steps, setting.seed)
     bounds = [best_possible(net, name, arrived[:k]) for k in range(setting.steps // 2 + 1, setting.steps + 1)]
-    return np.trace(bounds, axis1=2, axis2=3).mean(axis=1)
+    return np.asarray(np.trace(bounds, axis1=2, axis2=3).mean(axis=1))
 
 
 def simulated(net: hg.Network, setting: Setting) -> Mapping[str, dict[str, float]]:

@@ -91,5 +91,5 @@ def test_missing_data_is_seen():
 
 
 def test_inputs_of_another_size_are_refused():
-    with pytest.raises(ValueError, match=r"inputs: expected shape \(any, 1\), got shape \(7, 2\)"):
+    with pytest.raises(ValueError, match=r"inputs: expected shape \(rows, 1\), got shape \(7, 2\)"):
         ORIGINALS["Kalman"].planned(np.zeros((STEPS, 2)))

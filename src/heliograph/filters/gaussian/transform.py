@@ -22,6 +22,7 @@ POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
 Function = Callable[[jax.Array], jax.Array]
 
 
+@readable
 class Transformed(NamedTuple):
     """Moments of f(x): mean (m,), covariance (m, m) and cross covariance Cov(x, f(x)) of shape (n, m)."""
 
