@@ -155,7 +155,7 @@ def test_bad_numbers_are_refused_in_a_line(name, text, words):
 
 def test_an_object_that_is_made_of_other_arguments_than_it_holds_is_set_in_python():
     plant = hg.LinearPlant([[0.5]], [[1.0]], [0.0], [[1.0]])
-    with pytest.raises(ValueError, match="--set plant.matrix: expected a LinearPlant that is set in Python, got '2'"):
+    with pytest.raises(ValueError, match=r"--set plant\.matrix: expected a LinearPlant that is set in Python, got '2'"):
         with_values(Setting(plant=plant), {"plant.matrix": "2"})
 
 
