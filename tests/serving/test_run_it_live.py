@@ -102,7 +102,7 @@ def test_the_state_is_kept_beside_the_network_unless_it_is_told_otherwise(tmp_pa
     assert (count, refused, said) == (20, set(), "")
     assert cli.main(["serve", "net.py"]) == 2  # of another window
     said = capfd.readouterr().err
-    assert "option window: 10.0" in said and said.endswith("; to begin anew, name another\n")
+    assert "option window: 10.0" in said and said.endswith("; --accept-changes goes on with what fits\n")
 
 
 def test_a_store_is_called_as_its_network():
