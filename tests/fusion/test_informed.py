@@ -153,7 +153,7 @@ def test_losses_that_are_told_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
     fused = hg.run(along_and_linear(*random_case(7, nodes=2)), z).estimates["fused"]
-    np.testing.assert_allclose(fused["own matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(fused["local matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -224,7 +224,7 @@ def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
     data = {name: draw.normal(size=(6, node.received)) for name, node in net.nodes.items()}
     fused = hg.run(net, data).estimates["fused"]
     for name in ("matrix", "all_reports"):
-        ours, theirs = fused[f"cubature {name}"], fused[f"own {name}"]
+        ours, theirs = fused[f"cubature {name}"], fused[f"local {name}"]
         assert net.claims()["fused"][f"cubature {name}"] == "nominal"
         np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-6, atol=1e-6)

@@ -151,7 +151,7 @@ def test_verdicts_follow_the_evidence(result):
         ({"turning": 1 - 0.5 ** np.arange(18.0)}, {"The lower condition"}),
         ({"iterated": result.iterated._replace(subtracted=result.iterated.joseph)}, {"A V A'"}),
         ({"constant": critical["scalar"]}, {"The steady gain"}),
-        ({"unknown_losses": known}, {"Losses that the receiver"}),
+        ({"unknown_losses": known}, {"Losses that are not observed"}),
         ({"typical": 1e9}, {"Where E P diverges"}),
     ]
     seen = set()

@@ -31,13 +31,16 @@ def made(seed, seconds=60.0):
     def place(t):
         return np.stack([8 * np.cos(0.12 * t), 8 * np.sin(0.12 * t), 0 * t], axis=-1)
 
+    radio = np.random.default_rng(seed + 1000)  # received power falls with the logarithm of the distance, to 1 dB
     bias, quick, rows = 0.05 + 0.04 * rng.standard_normal(4), np.zeros(4), []
     for t in time:
         quick = 0.93 * quick + 0.37 * 0.04 * rng.standard_normal(4)
         tag = place(t - LATE) + np.array([0, 0, 1.0])
-        value = np.linalg.norm(tag - ANCHORS, axis=1) + bias + quick + 0.02 * rng.standard_normal(4)
+        distance = np.linalg.norm(tag - ANCHORS, axis=1)
+        power = -70.0 - 6.0 * np.log10(distance) + radio.standard_normal(4)
+        value = distance + bias + quick + 0.02 * rng.standard_normal(4)
         value -= np.where(rng.random(4) < 0.01, 5.0, 0.0)
-        rows += [(t + 0.001 * i, NAMES[i], value[i], -80.0) for i in range(4) if rng.random() > 0.08]
+        rows += [(t + 0.001 * i, NAMES[i], value[i], power[i]) for i in range(4) if rng.random() > 0.08]
     reference = np.arange(0, seconds, 0.125)
     return np.array(rows), np.column_stack([reference, place(reference)])
 
