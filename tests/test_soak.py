@@ -74,7 +74,7 @@ def test_chance_is_looked_at_again_and_what_is_broken_stays_broken(soak: ModuleT
     assert soak.looked_at_again(soak.Place(-5.0, 1, np.ones(2)), "upper", {}.get, ("a", "b"), np.zeros(2)) == (-5.0, 0)
 
 
-def test_what_is_no_number_and_not_told_is_hidden(soak: ModuleType) -> None:
+def test_what_is_no_number_and_unknown_is_hidden(soak: ModuleType) -> None:
     item = statistics(1.0)
     assert not soak.hidden(item)
     broken = np.array(item.pairs)

@@ -101,8 +101,6 @@ from .simulation.network import (
 )
 from .simulation.simulate import (
     monte_carlo as monte_carlo,
-)
-from .simulation.single_run import (
     simulate as simulate,
 )
 from .simulation.recorded import (

@@ -92,7 +92,7 @@ def test_a_hint_is_a_remedy(folder, text):
 
 
 @pytest.mark.parametrize("word", ["NA", "null", "-"])
-def test_a_word_for_nothing_is_told_to_be_empty(folder, word):
+def test_a_word_for_nothing_is_said_to_be_empty(folder, word):
     (folder / "data.csv").write_text(f"time,pos\n0,{word}\n")
     with pytest.raises(ValueError, match="a cell is empty where nothing arrived"):
         read_table("data.csv")

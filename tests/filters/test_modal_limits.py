@@ -18,7 +18,7 @@ def test_fading_in_bursts():
 
 
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
-def test_two_sensors_in_one_shadow_or_in_two(shared, limit):
+def test_two_sensors_with_shared_fading_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     links = hg.parallel([hg.shared(bursts(), "road") if shared else bursts()] * 2)
     assert variances(PLANT, two, links, STEPS)[-1, 0] == pytest.approx(limit, abs=6e-7)

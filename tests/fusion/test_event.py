@@ -25,7 +25,7 @@ def test_a_value_is_sent_when_it_has_changed_by_more_than_the_threshold(known):
     np.testing.assert_array_equal(sends.error(2), [0.25, 0.25] if known else [0.0, 0.0])
 
 
-def test_silence_taken_for_a_loss_needs_a_rule_that_hears_reports():
+def test_silence_taken_for_a_loss_needs_a_rule_that_receives_reports():
     plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
     nodes = {"a": hg.Node(sensor, hg.perfect(), {"local": hg.kalman_filter(plant, sensor)})}
     sends = hg.fusion.EventSending(0.1, announced=False)

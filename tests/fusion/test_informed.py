@@ -149,7 +149,7 @@ def along_and_linear(plant, parts):
 
 
 @pytest.mark.slow
-def test_losses_that_are_told_count_with_the_pattern_that_happened():
+def test_losses_that_are_said_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
     fused = hg.run(along_and_linear(*random_case(7, nodes=2)), z).estimates["fused"]

@@ -138,7 +138,7 @@ def sent_over(quantizer, values, arrives, restart=lambda k: False):
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), interval=st.integers(1, 7), loss=st.floats(0, 0.5))
-def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_published_again_within_the_interval(seed, interval, loss):
+def test_a_bound_that_is_said_holds_whatever_was_lost_and_is_published_again_within_the_interval(seed, interval, loss):
     rng = np.random.default_rng(seed)
     values, arrives = rng.normal(size=25) * 10 ** rng.uniform(-4, 4, 25), rng.random(25) > loss
     quantizer = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3, interval=interval)
@@ -151,7 +151,7 @@ def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_published_again_wit
         assert known or any(start <= lost <= k for lost in missed)  # the values since then have not all arrived
 
 
-def test_without_an_interval_a_loss_is_told_and_a_request_mends_it():
+def test_without_an_interval_a_loss_is_said_and_a_request_mends_it():
     values = [0.3, 40.0, 0.1, 0.2, 0.3, 0.4]
     results = {k: (r.error[0], s.synchronised[0]) for k, _, r, s in
              sent_over(ESCAPE, values, [True, False, True, True, True, True], lambda k: k == 4)}  # fmt: skip

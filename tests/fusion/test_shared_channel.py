@@ -84,7 +84,7 @@ def test_monte_carlo_agrees():
         assert estimate.claim == "exact" and abs(square.mean() - claimed) < 3 * square.std() / np.sqrt(len(square))
 
 
-def test_all_outputs_are_heard_once():
+def test_all_outputs_are_received_once():
     net = shared_network({})
     filters = {"alone": net.nodes["node 0"].filters}
     with pytest.raises(ValueError, match="to receive its 2 outputs, each once"):

@@ -155,7 +155,7 @@ def chain():
 
 
 @pytest.mark.slow
-def test_a_ridge_is_told_before_the_data():
+def test_a_ridge_is_said_before_the_data():
     """The route's mean gain and its noise, gain^2 0.2 + last noise, are two of three numbers."""
     before = hg.learning.identifiable(chain, INPUTS)
     assert before.ridges == 1 and before.identified == ()

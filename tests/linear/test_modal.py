@@ -67,7 +67,7 @@ def over_paths(moves, observe, rows, law, mean, covariance, steps):
     return np.array(results)
 
 
-def test_a_relay_that_filters_in_the_shadow_of_its_receiver():
+def test_a_relay_that_filters_in_the_fading_of_its_receiver():
     mean, spread = np.array([1.0, 0.5]), np.array([[1.0, 0.2], [0.2, 0.5]])
     system = hg.linear.modal_system(relay(Modes(CHAIN, LINKS)), received(Modes(CHAIN, BACK)), mean, spread, 5)
     expected = over_paths(

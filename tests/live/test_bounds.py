@@ -82,7 +82,7 @@ REFUSED = [
 ]
 
 
-def test_what_is_no_event_is_told_in_one_line_and_changes_nothing(network, monkeypatch):
+def test_what_is_no_event_is_said_in_one_line_and_changes_nothing(network, monkeypatch):
     timeline = hg.Timeline(network, 5.0)
     timeline.push("a", 0, 1.0, 1.0)
     before = timeline.save()

@@ -73,7 +73,7 @@ def test_what_does_not_fit_changes_nothing(name):
         np.testing.assert_array_equal(stream.push(z, [0.3]).mean, other.push(z, 0.3).mean)
 
 
-def test_a_filter_that_hears_nothing_takes_any_measurement():
+def test_a_filter_that_receives_nothing_takes_any_measurement():
     stream = hg.Stream(hg.filters.open_loop_filter(PLANT))
     for z in ([1.0], [1.0, 2.0], np.nan):
         stream.push(z, [0.0])

@@ -27,6 +27,6 @@ REFUSED = (
 )
 
 
-def test_a_fork_is_told_before_it_hangs():
+def test_a_fork_is_said_before_it_hangs():
     completed = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=120)
     assert completed.stdout.splitlines() == ["None", REFUSED], completed.stderr

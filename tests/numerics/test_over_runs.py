@@ -66,7 +66,7 @@ def test_derivatives_are_those_of_the_arithmetic_forward_and_back_one_or_many():
         np.testing.assert_allclose(items, 2 * A[0] @ B @ B.T, rtol=1e-14, atol=1e-14)
 
 
-def test_costly_cases_are_told_run_by_run_and_have_derivatives():
+def test_costly_cases_are_said_run_by_run_and_have_derivatives():
     def of(pick):
         return lambda x: pick(x > 1, lambda: x**3, lambda: x)
 

@@ -43,7 +43,7 @@ def test_a_line_says_what_to_write(make, line):
     assert str(error.value) == line
 
 
-def test_a_sensor_in_numpy_is_told_to_be_in_jax():
+def test_a_sensor_in_numpy_is_said_to_be_in_jax():
     plant = hg.LinearPlant(np.eye(2), 0.1, [0.0, 0.0], 1.0)
     sensor = hg.Sensor(lambda x: np.array([np.sin(x[0])]), 0.1)
     with pytest.raises(ValueError, match=r"of length 2, got one that calls NumPy or math: write it with jax\.numpy$"):

@@ -49,7 +49,7 @@ def test_components_are_lost_one_by_one():
     assert abs(lost[:, 0].mean() - 0.5) < LIMIT
 
 
-def test_a_loss_behind_an_erasure_that_nobody_is_told_of_reads_zero():
+def test_a_loss_behind_an_erasure_that_nobody_is_said_of_reads_zero():
     z = received(hg.dropout(hg.erasure(hg.perfect(), 0.5), 0.5), [1.0])
     shares = [np.isnan(z).mean(), np.mean(z == 1.0), np.mean(z == 0.0)]
     np.testing.assert_allclose(shares, [0.25, 0.25, 0.5], rtol=0, atol=LIMIT)

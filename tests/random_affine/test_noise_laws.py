@@ -84,7 +84,7 @@ def test_recorded_noise_has_the_samples_moments():
     np.testing.assert_allclose(law.covariance, np.cov(samples.T, bias=True), rtol=1e-12)
 
 
-def test_a_sample_too_small_for_the_order_is_told_and_the_number_named_is_enough():
+def test_a_sample_too_small_for_the_order_is_said_and_the_number_named_is_enough():
     g = np.random.default_rng(0)
     with pytest.warns(UserWarning, match=r"order 4 is known to \d+ % only; about [\d,]+ samples instead of 100"):
         hg.random_affine.recorded_noise(g.normal(size=100), 4)

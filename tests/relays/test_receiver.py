@@ -46,7 +46,7 @@ def best_from_all_measurements(p, gains):
     return np.array(result)
 
 
-def test_it_is_the_best_linear_function_of_everything_heard():
+def test_it_is_the_best_linear_function_of_everything_received():
     p = oracle.random_problem(2, horizon=6)
     net = network_of(p)
     gains = own_error_design(net, 6).gains

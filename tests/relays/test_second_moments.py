@@ -130,7 +130,7 @@ def test_without_interference_a_relay_is_a_kalman_filter_every_other_step(fading
             assert relative(design.covariance[f"relay_{f + 1}"][k], x[f]) < TOLERANCE
 
 
-def test_a_receiver_that_hears_only_noise_predicts():
+def test_a_receiver_that_receives_only_noise_predicts():
     p = problem(mean=zero([3, 4]))
     design = design_of(p)
     assert np.abs(design.gains["receiver"]).max() == 0.0

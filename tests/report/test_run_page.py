@@ -22,7 +22,7 @@ LINK = hg.erasure(hg.perfect(2), 0.9)
 GOOD = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
 SURE = hg.linear_filter(hg.LinearPlant(DRIFT, [[0.01]], [0.0], [[10.0]], states=["level"]), SENSOR, hg.perfect(2))
 NETWORK = hg.Network(
-    PLANT, {"a": hg.Node(SENSOR, LINK, {"good": GOOD, "sure": SURE}), BAD: hg.Node(SENSOR, hg.perfect(2), {})}
+    PLANT, {"a": hg.Node(SENSOR, LINK, {"sure": SURE, "good": GOOD}), BAD: hg.Node(SENSOR, hg.perfect(2), {})}
 )
 
 
@@ -46,7 +46,7 @@ def test_claims_are_judged_by_innovations(health):
     assert np.isclose(good.white[arrived, 0], first, rtol=1e-9)
 
 
-def test_links_are_told_as_they_were(health):
+def test_links_are_said_as_they_were(health):
     links = {(link.node, link.component): link for link in health.links}
     item = links[BAD, "right"]
     assert item.share == 1 - 4 / STEPS and item.longest_gap == 4 and not item.loses and links["a", "left"].loses
@@ -69,7 +69,7 @@ def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
     assert "a/sure" in page and "98.7%" in page and "</h2>\x1b" not in page and "&lt;/h2&gt;\\x1b" in page
     summary = json.loads(json.dumps(run_summary(health)))
     assert summary["rows"] == STEPS and summary["links"][BAD]["right"] == {"arrived": 1 - 4 / STEPS, "longest_gap": 4}
-    assert summary["filters"]["a"]["good"]["size"] == health.filters[0].test.power
+    assert summary["filters"]["a"]["good"]["size"] == next(f for f in health.filters if f.filter == "good").test.power
 
 
 def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():

@@ -96,7 +96,7 @@ def test_a_door_that_others_reach_needs_a_token():
             door(place, {})
 
 
-def test_the_page_shows_what_was_told_and_brings_all_it_needs():
+def test_the_page_shows_what_was_said_and_brings_all_it_needs():
     async def look(url: str) -> None:
         _, text, headers = await got(url)
         assert "default-src 'none'" in headers["content-security-policy"]

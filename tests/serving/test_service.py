@@ -164,7 +164,7 @@ BAD = {
 }
 
 
-def test_what_is_bad_is_told_and_changes_nothing():
+def test_what_is_bad_is_said_and_changes_nothing():
     good = lines(messages(1, len(BAD) + 1, seed=4, whole=True))
     bad = {payload.replace(b'{"node"', b'{"plant": "p0", "node"'): reason for payload, reason in BAD.items()}
     mixed = [good[0], *(line for i, item in enumerate(good[1:]) for line in (item, list(bad)[i % len(bad)]))]

@@ -99,7 +99,7 @@ def test_losses_on_two_hops_are_losses():
 
 @pytest.mark.parametrize("channel", [hg.hop(hg.Rayleigh(1.0), 0.1), hg.dropout(hg.perfect(), 0.99)])
 @pytest.mark.parametrize("a", [-1.25, 1.0])
-def test_random_gains_that_are_not_told_bound_no_unstable_mode(channel, a):
+def test_random_gains_that_are_unknown_bound_no_unstable_mode(channel, a):
     result = scalar(channel, a=[[a]])
     assert result.verdict == "impossible"
     assert "only through random gains that are not known" in result.reason
@@ -191,7 +191,7 @@ def test_bounds_under_bursts(fail, recover, bound):
     np.testing.assert_allclose(scalar(bursts(fail, recover)).bound, bound, atol=5e-5)
 
 
-def test_links_in_one_shadow_fail_together():
+def test_links_with_shared_fading_fail_together():
     """Two sensors: on chains of their own both are silent for long with rho 0.5^2, in one shadow with rho 0.5."""
     sensor = hg.LinearSensor([[1.0]], 1.0)
     local = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))

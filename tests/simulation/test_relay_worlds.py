@@ -163,7 +163,7 @@ def test_a_planned_silence_is_no_gap_and_a_loss_is_one(silences):
     assert np.all(np.isfinite(bound[:5])) and np.all(np.isnan(bound[5:]))
 
 
-def test_a_recording_needs_what_the_receiver_heard_alone(silences):
+def test_a_recording_needs_what_the_receiver_received_alone(silences):
     network, record = silences
     z = {name: values[0] for name, values in record.measurements.items()}
     alone, whole = run(network, {"receiver": z["receiver"]}), run(network, z)

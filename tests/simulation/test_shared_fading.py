@@ -57,7 +57,7 @@ def alone():
     return gains({"z": link(name="road")})["z"]
 
 
-def test_one_chain_is_one_shadow_across_nodes_and_another_is_not(received):
+def test_one_chain_is_one_fading_across_nodes_and_another_is_not(received):
     np.testing.assert_array_equal(received["a"], received["b"])
     np.testing.assert_array_equal(received["d"], received["z"])
     assert np.mean(received["a"] == received["c"]) < 0.8 and np.mean(received["a"] == received["d"]) < 0.8

@@ -11,7 +11,7 @@ INTERVAL = hg.smoothing.FixedInterval()
 HORIZON, RUNS = 15, 200
 
 
-def test_a_central_filter_without_random_gains_smooths_as_one_that_hears_all_at_once():
+def test_a_central_filter_without_random_gains_smooths_as_one_that_receives_all_at_once():
     links = [hg.hop(0.8, 0.1), hg.hop(1.1, 0.3)]
     central = hg.filters.sequential_filter([hg.cubature_filter(PLANT, SENSOR, link) for link in links])
     both = hg.LinearSensor([[1.0, 0.0], [1.0, 0.0]], 0.05 * np.eye(2))

@@ -78,7 +78,7 @@ def test_losses_are_gaps_within_a_boot_sorted_by_the_time_of_sending(tmp_path):
         (None, "expected a file, got nothing of that name"),
     ],
 )
-def test_what_is_no_log_is_told_in_one_line(tmp_path, content, message, capsys):
+def test_what_is_no_log_is_said_in_one_line(tmp_path, content, message, capsys):
     path = tmp_path / "log"
     if content is not None:
         path.write_bytes(content)
@@ -87,7 +87,7 @@ def test_what_is_no_log_is_told_in_one_line(tmp_path, content, message, capsys):
     assert message in lines[-1] and str(path) in lines[-1]
 
 
-def test_a_log_too_short_is_told_in_one_line(tmp_path, capsys):
+def test_a_log_too_short_is_said_in_one_line(tmp_path, capsys):
     path = written(tmp_path / "log", [row(2, k, 100 * k, 100 * k + 3) for k in range(20)])
     assert main(["example", "late-data", "--out", str(tmp_path / "out"), "--trace", str(path)]) == 2
     expected = "trace: expected packets sent from 300 to 1200 s after the first, got 0 of 20 over 28 s"

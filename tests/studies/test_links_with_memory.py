@@ -16,7 +16,7 @@ FILTERS = {"memoryless", "exact", "gpb1", "imm", "gpb2", "particle", "mode_late"
 TOGETHER = {"shared", "separate_claimed", "separate_true"}
 
 
-def test_one_shadow():
+def test_one_fading():
     result = compute.fading_together(Setting())
     assert result["shared"] == pytest.approx(0.227110, abs=6e-7)
     assert result["separate_claimed"] == pytest.approx(0.148447, abs=6e-7)

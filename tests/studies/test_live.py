@@ -23,7 +23,7 @@ from heliograph_studies.live.speed import PLANTS, many_plants
 
 
 @pytest.mark.real("NATS")
-def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
+def test_what_is_said_is_the_same_if_it_is_killed(tmp_path: Path):
     drive = read_drive(0)
     assert len(drive.lines) + drive.unreceived == 3632 and 0 < drive.unreceived < 300
     lines = drive.lines[:400]

@@ -143,7 +143,7 @@ def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     assert not np.array_equal(result["relay_1"], listeners.received(truth, 1)["relay_1"])
 
 
-def test_a_missing_simulator_is_told_before_the_work_starts(tmp_path, monkeypatch):
+def test_a_missing_simulator_is_said_before_the_work_starts(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gym_electric_motor", None)
     with pytest.raises(ModuleNotFoundError) as caught:
         motor_drive.run(out=tmp_path / "out")

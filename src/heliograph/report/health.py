@@ -136,14 +136,14 @@ def examine(
 
 
 def _relied_on(network: Network) -> dict[str, set[str]]:
-    """Return the filters that the network relies on, by node: those that are fused, else those of the strongest claim.
+    """Return the filters that the network relies on, by node: fused ones, else the first of the strongest claim.
 
-    A filter with a weaker claim than another of its node, such as one that takes the mean of a random gain for it, is
-    there to be compared with.
+    Others, such as one that takes the mean of a random gain for it, are there to be compared with.
     """
     fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
     results = {}
     for node, place in network.nodes.items():
         claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
-        results[node] = fused & set(claims) or {name for name, s in claims.items() if s == max(claims.values())}
+        strongest = [name for name, s in claims.items() if s == max(claims.values())]
+        results[node] = fused & set(claims) or set(strongest[:1])
     return results

@@ -1,4 +1,4 @@
-"""Steps of all filters without implausible data, and the messages about them for a recording."""
+"""Steps of all filters without implausible data, messages about them, and values that a sender's rule forbids."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,12 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
+from heliograph.model.over_time import first
+from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import Drawn
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.stepping import AllFilters
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
+
+RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
 def implausible(result: Mapping[str, PyTree]) -> jax.Array:
@@ -139,3 +144,32 @@ def _rows(rows: Sequence[int]) -> str:
     """Rows from 1, the first few."""
     listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
+
+
+def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+    """Rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+
+    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
+    uses such a value and gives it a floor of 1e-6 as its probability.
+    """
+    trigger = node.trigger if isinstance(node, Node) else None
+    if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
+        return []
+    assert isinstance(node, Node)  # as it has a trigger
+    channel = first(node.channel)
+    if channel.erases or channel.remembers or channel.outputs != len(node.outputs):
+        return []
+    # Each value against the one before it.
+    result, last = list[int](), None
+    for k, row in enumerate(z[:, : len(node.outputs)]):
+        if np.isnan(row).any():
+            continue
+        if last is not None:
+            due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
+            error = np.abs(row - z[last, : len(row)])
+            delta = (1 - RIM) * np.asarray(trigger.delta)
+            inside = np.linalg.norm(error) <= delta if trigger.region == "ball" else np.all(error <= delta)
+            if inside and not due:
+                result.append(k)
+        last = k
+    return result

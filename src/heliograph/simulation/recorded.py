@@ -17,8 +17,7 @@ from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
-from heliograph.simulation.forbidden import forbidden_rows
-from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
+from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record

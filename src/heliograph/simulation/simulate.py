@@ -15,7 +15,7 @@ from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
@@ -223,3 +223,28 @@ def _simulated(world: World, later: Smoother | None, u: PyTree, key: jax.Array, 
 
 # Traced once, for its shapes and for the program alike: tracing is half of what a first call takes.
 _trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulated, inline=True)  # type: ignore[call-overload]
+
+
+def simulate(
+    network: Network,
+    horizon: int,
+    key: int | jax.Array,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
+    smooth: AbstractSmoothing | None = None,
+) -> Record:
+    """Simulate one run of the network and every filter on it: the first run of `monte_carlo` with the same key.
+
+    Args:
+        network: the network.
+        horizon: number of steps.
+        key: a seed or a JAX key.
+        inputs: (horizon, inputs); by default a plant without inputs is assumed.
+        smooth: smoothing as in `monte_carlo`; None by default.
+
+    Returns:
+        The record, without an axis of runs: `truth` (time, n), `measurements` by node, `estimates` by node and filter.
+
+    Raises:
+        ValueError: what `monte_carlo` refuses.
+    """
+    return monte_carlo(network, horizon, 1, key, inputs=inputs, smooth=smooth).of_run(0)

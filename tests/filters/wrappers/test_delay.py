@@ -53,7 +53,7 @@ def filters():
     return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNKNOWN)}
 
 
-def test_not_told_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
+def test_unknown_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
     received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
     result = true_error(filters["uninformed"], PLANT, SENSOR, UNKNOWN, STEPS)
     best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, STEPS + 1)])
@@ -98,7 +98,7 @@ numbers = st.floats(-1.0, 1.0)
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(numbers, min_size=4, max_size=4), st.lists(numbers, min_size=2, max_size=2), st.integers(0, 2**32 - 1))
-def test_not_told_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
+def test_unknown_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
     """Two hops, the first late by 0, 1 or 3 steps: z = g (y + m) + n, so that g m + n is noise of N (E g^2 + 1)."""
     generator = np.random.default_rng(seed)
     a, c, r, q = (
@@ -134,7 +134,7 @@ def test_delays_that_are_a_chain():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_told_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
+def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
     """Values received twice, out of order, lost, and too late to be of any step."""
     generator = np.random.default_rng(seed)
     delays = generator.choice(3, p=WEIGHTS, size=12)

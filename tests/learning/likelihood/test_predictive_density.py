@@ -65,7 +65,7 @@ def test_a_common_gain_ties_its_outputs():
     assert result.pit[0, 1] == pytest.approx(below / first, rel=1e-12)
 
 
-def test_parts_of_a_stack_are_heard_one_after_another():
+def test_parts_of_a_stack_are_received_one_after_another():
     """With known gains the chain of parts is exact: the density of the pair, whichever is missing."""
     channel = hg.parallel([hg.hop(0.8, 0.1), hg.hop(1.2, 0.2)])
     gain, noise = np.diag([0.8, 1.2]), np.diag([0.1, 0.2])

@@ -148,7 +148,7 @@ def test_the_law_that_foretells_best_is_chosen(learned):
     assert hg.learning.learn_losses(BURSTS, held_out=0).best == "hidden"
 
 
-def test_independent_losses_are_told_from_bursts():
+def test_independent_losses_are_said_from_bursts():
     result = hg.learning.learn_losses((np.random.default_rng(2).random(600) < 0.2).astype(float))
     assert not result.memory.significant
     assert abs(result.held_out["hidden"].gain) < 3 * result.held_out["hidden"].gain_error + 1e-3

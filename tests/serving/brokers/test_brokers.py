@@ -27,7 +27,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     yield from running(tmp_path_factory.mktemp("server"))
 
 
-def test_the_url_is_told_without_what_is_secret():
+def test_the_url_is_said_without_what_is_secret():
     result = address("mqtts://me:p%40ss@example.org/site/one", {})
     assert (result.kind, result.host, result.port, result.topic) == ("mqtt", "example.org", 8883, "site/one")
     assert (result.user, result.password) == ("me", "p@ss") and result.secure

@@ -133,7 +133,7 @@ def test_a_slow_reader_slows_the_sender_and_stopping_waits_for_it_no_longer_than
         os.close(end)
 
 
-def test_a_service_that_is_told_to_stop_tells_what_it_took():
+def test_a_service_that_is_said_to_stop_tells_what_it_took():
     (source, sender), (reader, target) = os.pipe(), os.pipe()
     service = Service(fleet(stepping()), InMemoryStore())
     os.write(sender, b"".join(line + b"\n" for line in lines(messages(1, 10, 0, whole=True))))

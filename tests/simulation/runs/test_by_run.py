@@ -78,7 +78,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
         np.testing.assert_allclose(getattr(sums, name), getattr(stored, name), rtol=1e-10, atol=1e-12)
 
 
-def test_columns_of_what_relays_heard_may_be_left_out():
+def test_columns_of_what_relays_received_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, own_error_design(net, 4))
     receivers = {"local": hg.filters.ScheduledFilter(schedules.pop("receiver"))}

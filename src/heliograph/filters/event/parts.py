@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.filters.event.truncated_normal import truncated_normal
 from heliograph.numerics.linalg import symmetrize
-from heliograph.numerics.truncated_normal import truncated_normal
 from heliograph.numerics.types import Array, Float
 
 FLOOR = 1e-6  # probability of what the rule forbids

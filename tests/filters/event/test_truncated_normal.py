@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
+from heliograph.filters.event.truncated_normal import truncated_normal
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.truncated_normal import truncated_normal
 
 moments = compiled(truncated_normal)
 # Of a Gauss-Legendre rule with 40 nodes over 17 deviations or less: 1.2e-13 is what 1,500 random intervals showed.
