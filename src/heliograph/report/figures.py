@@ -52,7 +52,10 @@ class Curve:
 @matplotlib.rc_context(STYLE)
 def paths(truth: np.ndarray, curves: Sequence[Curve], beacons: np.ndarray) -> Figure:
     """Plot paths on a map in metres, one panel for each, over the true path."""
-    figure = Figure(figsize=(WIDTH, WIDTH / len(curves) + 0.9), layout="constrained")
+    # A metre is as long across as along: a panel is as high as the paths are for their width, at most a square.
+    extent = np.ptp(np.concatenate([truth, beacons, *(c.values[np.isfinite(c.values).all(1)] for c in curves)]), axis=0)
+    height = WIDTH / len(curves) * min(1.0, max(0.25, extent[1] / extent[0])) if extent[0] > 0 else WIDTH / len(curves)
+    figure = Figure(figsize=(WIDTH, height + 0.9), layout="constrained")
     row = figure.subplots(1, len(curves), squeeze=False, sharex=True, sharey=True)[0]
     for axes, curve in zip(row, curves, strict=True):
         (true,) = axes.plot(*truth.T, color=PALE, linewidth=3.5)

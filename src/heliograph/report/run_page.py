@@ -270,11 +270,13 @@ def outputs_table(health: Health) -> list[Table]:
     """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
     rows = []
     for item in health.outputs:
+        # Numbers of the summary; the bias to the digits that its interval holds.
         s = item.summary
         doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if item.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
         name = visible(f"{item.node}/{item.filter}: {item.output}")
-        rows.append([name, f"{s.received} of {s.expected}", doubted, f"{s.bias:.3g} ± {half:.1g}", f"{s.squared:.2f}",
+        bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
+        rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
                      "to blame" if item.outlying else ""])  # fmt: skip
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
