@@ -128,6 +128,7 @@ def fit(
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
+    truth: ArrayLike | Sequence[ArrayLike] | bool = False,
 ) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 
@@ -138,6 +139,10 @@ def fit(
     included; delta and losses are free numbers like others. A heartbeat is a whole number: fit with each that may be,
     and compare `log_likelihood`. The result is a `SenderFit`.
 
+    With `truth` what is maximised is the log density of the true states under the estimates of the network's one
+    filter, its rule and its claim included: for errors that are correlated from row to row, of which the likelihood of
+    the measurements takes the small difference between rows for the whole.
+
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
@@ -146,19 +151,24 @@ def fit(
         starts: number of starts: the given one, and others drawn around it.
         seed: seed of the starts that are drawn.
         progress: called with a line of text at each step.
+        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True
+            takes those that the recordings hold.
 
     Raises:
         ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit
-            it, are too short or constant; a free number on which nothing depends; a start that is impossible.
+            it, are too short or constant; a free number on which nothing depends; a start that is impossible; truth
+            and not one filter, of all that arrives.
     Source: Schweppe (1965) for the likelihood; Huber (1967) for intervals where it is not the true one.
     """
     check_count("starts", starts)
     description = describe(network)
     if decides(description.start):
+        if truth is not False:
+            raise fail("truth", "none behind a sender that decides when to send", "one")
         return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
-    data = gathered(description.start, recording, inputs, description.parameters.size)
+    data = gathered(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
-    surfaces = [Surface(objective, data) for objective in objectives(description)]
+    surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
     say: Progress = progress or (lambda line: None)
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
     stopped, ends, solutions = False, np.zeros(0), []

@@ -21,6 +21,7 @@ from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
+from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
@@ -72,18 +73,20 @@ def _joint_channel(channel: Channel) -> Channel:
     return arrived(channel)
 
 
-Form = Literal["linear", "conditional"]
+Form = Literal["linear", "conditional", "truth"]
 
 
 class Data(NamedTuple):
     """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
 
-    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,).
+    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
+    truth (recordings, steps, n), the true states where these are learned from, NaN where they are not known.
     """
 
     measurements: Float[np.ndarray, "recordings steps received"]
     inputs: Float[np.ndarray, "recordings steps inputs"]
     lengths: tuple[int, ...]
+    truth: Float[np.ndarray, "recordings steps n"] | None = None
 
     @property
     def plain(self) -> bool:
@@ -131,7 +134,7 @@ class Objective:
 
     Args:
         description: the network with its free numbers.
-        form: "linear" or "conditional".
+        form: "linear" or "conditional", the measurements' likelihood; "truth", the density of the true states.
         steady: true for a `LinearFilter` of which nothing varies over time, so that its gains reach a steady state.
         random: true if gains are random, so that gains of the filter depend on the state's second moment.
     """
@@ -169,9 +172,27 @@ class Objective:
         )[1]
         return result
 
+    def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
+        """Errors of the estimates (steps, n), NaN where the truth is not known, and what is claimed (steps, n, n)."""
+        item, plant = self.filter(x), first(self.description.start.plant)
+        places = np.array([self.description.start.states.index(name) for name in item.states])
+        angles = tuple(i for i, place in enumerate(places) if place in plant.angles)
 
-def objectives(network: Description) -> list[Objective]:
-    """Objectives that the network allows, the linear one first.
+        def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
+            k, z_k, u_k, true = row
+            after, _ = item.correct(item.predict(state, u_k, k), z_k, k)
+            estimate = item.estimate(after)
+            mean, covariance = jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
+            return after, (nearest(true, mean, angles) - mean, covariance)
+
+        start = jax.tree.map(jnp.asarray, item.init())
+        rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(truth)[:, places]
+        result: tuple[jax.Array, jax.Array] = jax.lax.scan(body, start, rows)[1]
+        return result
+
+
+def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
+    """Objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
 
     Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
     whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
@@ -181,6 +202,9 @@ def objectives(network: Description) -> list[Objective]:
         ValueError: a network whose likelihood no filter here knows.
     """
     built = network.start
+    if by_truth:
+        sole_filter(built)
+        return [Objective(network, "truth", False, False)]
     forms, steady = forms_of(built), _is_steady(built)
     return [Objective(network, form, steady and form == "linear", len(forms) > 1) for form in forms]
 
@@ -207,11 +231,30 @@ def _is_steady(network: Network) -> bool:
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
-    """Filter of all that the network's nodes receive, whose likelihood is of this form."""
+    """Filter of all that the network's nodes receive, whose likelihood is of this form; "truth": the network's own."""
+    if form == "truth":
+        return sole_filter(network)
     plant, sensor, channel = joint_world(network)
     if form == "linear":
         return linear_filter(plant, sensor, channel)
     return cubature_filter(plant, sensor, without_memory(channel))
+
+
+def sole_filter(network: Network) -> AbstractFilter:
+    """Only filter of a network, of all that arrives.
+
+    Raises:
+        ValueError: none, several, or one that claims no covariance.
+    """
+    nodes = list(network.nodes.values())
+    local = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
+    items = [*local.values(), *(item for item in network.fused.values() if isinstance(item, AbstractFilter))]
+    if len(items) != 1:
+        expected = "one filter, of all that arrives, whose estimates are compared with them"
+        raise fail("network to be learned by its true states", expected, len(items) or "none")
+    if items[0].claim == "none":
+        raise fail("filter to be learned by true states", "one that claims a covariance", "one that claims none")
+    return items[0]
 
 
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
@@ -229,14 +272,14 @@ def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data
         for begin in range(0, len(left), lanes):
             places = left[begin : begin + lanes]
             full = x[places + places[-1:] * (lanes - len(places))]
-            result = to_numpy(_at_points(objective, full, data.measurements, data.inputs))
+            result = to_numpy(_at_points(objective, full, data.measurements, data.inputs, data.truth))
             every |= {i: Evaluation(*(leaf[lane] for leaf in result)) for lane, i in enumerate(places)}
     return Evaluation(*(np.stack(item) for item in zip(*(every[i] for i in range(len(x))), strict=True)))
 
 
 @quickly_compiled
-def _at_points(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    evaluation: Evaluation = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
+def _at_points(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None) -> Evaluation:
+    evaluation: Evaluation = jax.vmap(lambda point: all_recordings(objective, point, z, u, truth))(jnp.asarray(x))
     return evaluation
 
 
@@ -256,21 +299,25 @@ def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evalua
     return result._replace(halves=jnp.sum(result.halves, axis=0)), converged
 
 
-def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+def all_recordings(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None) -> Evaluation:
     """Evaluation at one point: density (recordings, steps), score (recordings, steps, p), halves (2, p, p)."""
-    result = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
+    result = jax.vmap(partial(one_recording, objective, x))(*jax.tree.map(jnp.asarray, (z, u, truth)))
     return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
 
 
-def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
     """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p).
 
     s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
-    components that arrived; derivatives run forward through the scan.
+    components that arrived; derivatives run forward through the scan. With the true states e is the error of the
+    estimates and S what they claim.
     """
-    local = partial(objective.innovations, z=z, u=u)
+    compared = z if truth is None else truth
+    local = (
+        partial(objective.innovations, z=z, u=u) if truth is None else partial(objective.errors, z=z, u=u, truth=truth)
+    )
     (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
-    return Evaluation(*_scored(e, s, de, ds, jnp.asarray(z)))
+    return Evaluation(*_scored(e, s, de, ds, jnp.asarray(compared)))
 
 
 def _scored(

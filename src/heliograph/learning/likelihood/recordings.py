@@ -14,8 +14,17 @@ from heliograph.simulation.network import Network
 FEWEST = 10  # numbers that arrived for each free one
 
 
-def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[ArrayLike] | None, free: int) -> Data:
-    """Gather all recordings, checked against the network, as `Data`.
+Truth = ArrayLike | Sequence[ArrayLike] | bool
+
+
+def gathered(
+    network: Network,
+    recording: object,
+    inputs: ArrayLike | Sequence[ArrayLike] | None,
+    free: int,
+    truth: Truth = False,
+) -> Data:
+    """Gather all recordings, checked against the network, as `Data`; with true states where these are asked for.
 
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
@@ -30,10 +39,12 @@ def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[A
     for z, _ in parts:
         network.check_horizon(len(z))
     longest = max(len(z) for z, _ in parts)
+    true = [] if truth is False else _truths(network, several, truth, [len(z) for z, _ in parts])
     data = Data(
         np.stack([_filled(z, longest, np.nan) for z, _ in parts]),
         np.stack([_filled(u, longest, None) for _, u in parts]),
         tuple(len(z) for z, _ in parts),
+        np.stack([_filled(x, longest, np.nan) for x in true]) if true else None,
     )
     _check_enough(data, free)
     return data
@@ -45,6 +56,24 @@ def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
     if len(inputs) != len(several):
         raise fail("inputs", f"those of each of the {len(several)} recordings", f"{len(inputs)} of them")
     return inputs[index]
+
+
+def _truths(network: Network, several: Sequence[object], truth: Truth, steps: list[int]) -> list[np.ndarray]:
+    """True states (steps, n) of each run of each recording, NaN where they are not known.
+
+    Raises:
+        ValueError: recordings without them, other shapes.
+    """
+    held = [getattr(item, "truth", None) for item in several] if truth is True else truth
+    listed = held if isinstance(held, list | tuple) and len(held) == len(several) else [held]
+    if len(listed) != len(several) or any(item is None for item in listed):
+        got = "none" if truth is True else f"{len(listed)} of them"
+        raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
+    runs = [run for item in map(np.asarray, listed) for run in (item if item.ndim == 3 else [item])]
+    if len(runs) != len(steps):
+        raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
+    return [array("truth", run, (count, len(network.states)), missing=True)
+            for run, count in zip(runs, steps, strict=True)]  # fmt: skip
 
 
 def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -90,10 +119,12 @@ def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray
 
 
 def _check_enough(data: Data, free: int) -> None:
-    z = data.measurements
+    z = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(z)))
     if count < FEWEST * free:
-        raise fail("recording", f"at least {FEWEST * free} numbers that arrived for {free} free ones", count)
+        known = "that arrived" if data.truth is None else "of the truth"
+        raise fail("recording", f"at least {FEWEST * free} numbers {known} for {free} free ones", count)
+    z = data.measurements
     flat = z.reshape(-1, z.shape[-1])
     received = [column[~np.isnan(column)] for column in flat.T]
     still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
