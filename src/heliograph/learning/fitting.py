@@ -27,6 +27,7 @@ INVISIBLE = 0.01  # information of a logarithm below which its number may as wel
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
+Rows = TypeAliasType("Rows", ArrayLike | Sequence[ArrayLike])  # of one recording, or a list of one for each
 
 
 @readable
@@ -124,11 +125,11 @@ class Fit:
 def fit(
     network: Build,
     recording: object,
-    inputs: ArrayLike | Sequence[ArrayLike] | None = None,
+    inputs: Rows | None = None,
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
-    truth: ArrayLike | Sequence[ArrayLike] | bool = False,
+    truth: Rows | bool = False,
 ) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 

@@ -35,6 +35,7 @@ from .past import (
 )
 from .bias import (
     with_bias as with_bias,
+    with_sensor_bias as with_sensor_bias,
 )
 from .relays import (
     RelayNetwork as RelayNetwork,
