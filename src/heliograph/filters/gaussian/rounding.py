@@ -16,6 +16,16 @@ def initial_size(mean: Array, covariance: Array) -> Float[jax.Array, " n"]:
     return seconds
 
 
+def output_rounding(matrix: Array, size: Array) -> Float[jax.Array, " m"]:
+    """Deviation of H x by rounding alone, (n + 2) eps |H| root E[x x'] of the state at the start: (m,).
+
+    What a combination of outputs without noise says of a state that is known better is no measurement: by it the
+    rounding of z would be divided by a deviation below it.
+    """
+    reach: jax.Array = jnp.abs(jnp.asarray(matrix)) @ jnp.sqrt(size)
+    return (len(size) + 2) * float(np.finfo(reach.dtype).eps) * reach
+
+
 @runs_last
 def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array) -> jax.Array:
     """P and, of each variance of which a precise measurement left next to nothing, what the mean cannot say.

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import describe
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size, output_rounding
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
@@ -27,7 +27,7 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, check_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.over_runs import runs_last
@@ -97,11 +97,11 @@ class LinearFilter(AbstractSizedFilter):
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         # Moments of the signal: the innovation part C P C' + R, and E[y y'] before any data.
         y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-        y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
-        # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
-        gain, bound = self.rule.correct(state.covariance, y, channel, ~jnp.isnan(z))
         start = at(self.plant, 0)
         size = initial_size(start.initial_mean, start.initial_covariance)
+        y = with_sensor(y, sensor, size)
+        # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
+        gain, bound = self.rule.correct(state.covariance, y, channel, ~jnp.isnan(z))
         bound = above_rounding(bound, state.covariance, size)
         mean, covariance, expected = used(
             state.mean,
@@ -187,6 +187,12 @@ def signal(
     mean = times_vector(c, state_mean) + noise_mean
     second = congruence(c, state_covariance) + noise + mean[:, None] * mean[None]
     return Signal(mean, times(c, cross) + noise, cross, second)
+
+
+def with_sensor(y: Signal, sensor: LinearSensor, size: jax.Array) -> Signal:
+    """Signal with what an update needs to keep its digits: C, Cov v, and the rounding of y."""
+    matrix, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
+    return y._replace(matrix=matrix, noise=noise, rounding=output_rounding(matrix, size))
 
 
 @runs_last

@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
@@ -177,10 +178,9 @@ class LinearSystemFilter(AbstractSizedFilter):
         used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
         # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
-        after = Belief(
-            mean + solved.T @ jnp.where(present, z - expected, 0.0),
-            covariance_after(spread, cross, used, solved, observed, noise),
-        )
+        left = covariance_after(spread, cross, used, solved, observed, noise)
+        left = above_rounding(left, spread, initial_size(self.mean, self.covariance))
+        after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 
     @in_float64

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation
 from heliograph.filters.modes.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
@@ -137,7 +138,10 @@ class MixtureFilter(AbstractSizedFilter):
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
-        result = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        start = at(self.plant, 0)
+        size = initial_size(start.initial_mean, start.initial_covariance)
+        after = above_rounding(symmetrize(after), spread, size)
+        result = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
 
     @in_float64

@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predict
 from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
-from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, within_range
+from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, with_sensor, within_range
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
@@ -133,8 +133,7 @@ def _use(
 ) -> tuple[LinearBelief, jax.Array, jax.Array]:
     """Return the updated belief, the expected measurement and the innovation covariance."""
     of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
-    noise = jnp.asarray(sensor.noise.covariance)
-    y = signal(prior[1:], *of, noise)._replace(matrix=of[0], noise=noise)
+    y = with_sensor(signal(prior[1:], *of, jnp.asarray(sensor.noise.covariance)), sensor, size)
     gain, bound = Polytope().correct(prior.covariance, y, described, ~jnp.isnan(z))
     bound = above_rounding(bound, prior.covariance, size)
     through = jnp.asarray(described.mean_gain), jnp.asarray(described.offset)
