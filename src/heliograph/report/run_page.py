@@ -96,9 +96,12 @@ def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     names = _components(health)
     for axes, item in zip(grid, tested, strict=True):
         white = np.asarray(item.white)
+        # A colour for each output; of more outputs than colours, such as a centre's, one for all.
+        alike = white.shape[1] > len(COLOURS)
         for i, component in enumerate(white.T):
-            name, colour = names[item.node][i], COLOURS[i % len(COLOURS)]
-            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=in_figure(name))
+            name, colour = ("outputs", BLUE) if alike else (names[item.node][i], COLOURS[i])
+            label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
+            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
         axes.set_title(in_figure(f"{item.node}/{item.filter}"))
@@ -274,8 +277,8 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     tested = _tested(health)
     pictures = {
         filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
-                                 "Innovations in claimed standard deviations, one colour an output; 5 of 100 may lie "
-                                 f"beyond ±{BAND:g}.")
+                                 f"Innovations in claimed standard deviations, one colour an output (of more than "
+                                 f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
         for name, filters in tested.items()
     }  # fmt: skip
     drawn = {item.node for filters in tested.values() for item in filters}
