@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.innovation_summary import InnovationSummary, outlying, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, Innovation
 from heliograph.report.results import Json
