@@ -33,14 +33,19 @@ def run_results(health: Health, network: str) -> Results:
 
 def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
-    drawn = {}
-    for kind, record in (("estimates", health.record), ("smoothed", health.record.smoothed)):
-        nodes = [] if record is None else _nodes(record)
-        drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(nodes)}
+    drawn: dict[str, Figure] = {}
+    for kind, record in _estimated(health):
+        drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
     drawn |= {name: _innovations(health, tested) for name, tested in _tested(health).items()}
     if health.links:
         drawn["links"] = _links(health)
     return drawn
+
+
+def _estimated(health: Health) -> list[tuple[str, Record]]:
+    """Return the filtered estimates, and the smoothed ones if there are any, by kind."""
+    later = health.record.smoothed
+    return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
 
 def _nodes(record: Record) -> list[str]:
@@ -155,16 +160,15 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     # Filtered estimates, then smoothed ones if there are any.
-    estimates = [
-        block
-        for kind, item, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
-        for block in _chosen({
+    estimates: list[Picture | Choice] = []
+    for kind, item in _estimated(health):
+        added = ", given later data too" if kind == "smoothed" else ""
+        estimates += _chosen({
             node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                           f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
                           f"side{added}.")
-            for i, node in enumerate([] if item is None else _nodes(item))
-        })
-    ]  # fmt: skip
+            for i, node in enumerate(_nodes(item))
+        })  # fmt: skip
     # Warnings are in the title and in the first section.
     return Page(
         kicker="Heliograph run",
