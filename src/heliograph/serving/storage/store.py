@@ -114,6 +114,7 @@ class Store:
             with self._saying("a database that can be written"):
                 self.identity = self._stored_identity(mine)
                 self._check_layout()
+                # The network must be the same, unless its plants are carried over or any will do.
                 if carrier is None and mine is not None:
                     check_same(f"store {self.name}", _compared(mine), _compared(self.identity))
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
