@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.scores import AbstractWeights, Corrected, Expected, score_update, weighted_update
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_transform
 from heliograph.filters.innovation import innovation_covariance, log_density
@@ -16,8 +16,7 @@ from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.filters.weights import StudentVB
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
@@ -25,8 +24,8 @@ from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.linalg import congruence, diagonal, times
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, diagonal, times
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.moments.second_moments import SecondOrder

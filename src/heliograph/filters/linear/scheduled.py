@@ -10,14 +10,13 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.linear.recursion import RANK_TOLERANCE
-from heliograph.linear.schedule import Gains, Schedule
-from heliograph.linear.system import LinearSystem, Steps
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names

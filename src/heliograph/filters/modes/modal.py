@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size, output_rounding
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep

@@ -29,13 +29,12 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import spread_of, symmetrize
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import spread_of
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import symmetric_product
-from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 
 
 class SideInformation(Module):
