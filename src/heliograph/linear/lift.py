@@ -14,9 +14,8 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.linalg import with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
+from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents, position

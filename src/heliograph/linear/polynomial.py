@@ -25,9 +25,8 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import exponents, symmetric_power
 from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments

@@ -9,9 +9,8 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import Steps
-from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, own_units
 from heliograph.numerics.module import readable

@@ -15,8 +15,8 @@ from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.combine import known
 
 
 @overload

@@ -7,13 +7,13 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import fail, items, shown
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, stacked
+from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import Moments
 
 T = TypeVar("T")
 

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
 from heliograph.numerics.check import (
@@ -27,7 +26,7 @@ from heliograph.numerics.check import (
 )
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
@@ -15,7 +14,7 @@ from heliograph.numerics.check import array, fail, instance, items, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
 OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance

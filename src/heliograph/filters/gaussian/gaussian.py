@@ -17,8 +17,7 @@ from heliograph.filters.innovation import gaussian_innovation, innovation_covari
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link, mean_gain, perfect
+from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack

@@ -15,8 +15,7 @@ from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.filters.weights import StudentVB
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first

@@ -20,9 +20,8 @@ from heliograph.filters.gaussian.correction import (
 )
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
+from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,

@@ -13,8 +13,7 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predict
 from heliograph.filters.innovation import log_density, mixed_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
@@ -25,10 +24,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize, with_rounding
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Gaussian, Independent, Shaped

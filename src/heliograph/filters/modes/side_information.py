@@ -23,9 +23,9 @@ from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import symmetric_product
-from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 
 
 class SideInformation(Module):

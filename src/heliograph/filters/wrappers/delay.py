@@ -14,9 +14,9 @@ from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
+from heliograph.model.enlarged import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
-from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
@@ -24,11 +24,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
-from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
-from heliograph.random_affine.combine import Series
-from heliograph.random_affine.delay import Delayed, of_line, sent
-from heliograph.random_affine.in_line import Relayed
+from heliograph.random_affine.combine import Series, known
+from heliograph.random_affine.delay import Delayed, Relayed, of_line, sent
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.random_affine.noise import Gaussian, Independent
 

@@ -16,7 +16,7 @@ from heliograph.filters.linear.linear import linear_filter
 from heliograph.filters.rows import over_rows
 from heliograph.learning.description import Description
 from heliograph.model.channel import Channel, parallel
-from heliograph.model.clock import joint_sensor
+from heliograph.model.enlarged import joint_sensor
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant

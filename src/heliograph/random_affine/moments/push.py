@@ -10,13 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, plain, stacked
-from heliograph.random_affine.atoms import GainAndNoise, gain_moments, homogeneous
+from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Mixture, Series
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, gain_moments, homogeneous
 from heliograph.random_affine.moments.monomials import (
     Exponents,
     count,
