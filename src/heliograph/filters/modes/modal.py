@@ -234,7 +234,7 @@ def linear_observation(
 
 
 def mean_rounding(start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array) -> jax.Array:
-    """What `above_rounding` adds to x = sum_j zeta^j, for each mode by its probability: (N, N), of Cov(zeta) (N, N)."""
+    """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
     n, size = len(start.initial_mean), initial_size(start.initial_mean, start.initial_covariance)
     projection = sum_of_modes(n, len(law))
     left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
