@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
@@ -145,19 +145,8 @@ class AbstractFilter(Module):
         z, u = measured(self, z), given(self, u)
         return _step_with_smoother(self, state, z, u, step_number(self, k))
 
-    def smoother_step(
-        self, before: PyTree, prior: PyTree, after: PyTree, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
-        """Return the smoother step k: what the backward pass needs of it.
-
-        Args:
-            before: the filter's state before the step.
-            prior: the state after `predict`.
-            after: the state after `correct`.
-            innovation: the innovation of the correction.
-            z: measurement (received,).
-            u: input (inputs,).
-            k: number of the step.
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+        """Return what the backward pass needs of a step, from the filter's states around it.
 
         Raises:
             ValueError: a filter without a covariance that `correct` updates, or without a known motion of its state.
@@ -224,7 +213,7 @@ def _step_with_smoother(
 ) -> tuple[PyTree, AbstractSmootherStep]:
     prior = item.predict(state, u, k)
     after, innovation = item.correct(prior, z, k)
-    return after, with_nis(item.smoother_step(state, prior, after, innovation, z, u, k), innovation)
+    return after, with_nis(item.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:

@@ -1,6 +1,5 @@
 """Gaussian filter: mean and covariance by a transform (cubature, Jacobian), on the channel's second moments."""
 
-from dataclasses import replace
 from typing import TypeVar
 
 import equinox as eqx
@@ -8,15 +7,15 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step.building import linear_smoother_step, observed_through
 from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
@@ -62,28 +61,14 @@ class GaussianFilter(AbstractBeliefFilter):
         link, z = at(self.channel, k), jnp.asarray(z)
         return corrected(state, signal, link, self.rule, z, size, self.observed_angles, unknown)
 
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update itself where it is linear, else the moments around it."""
-        plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
-            cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
-            return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
-        # F, Q and M H of the step.
-        u = jnp.asarray(u)
-        observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
-        step = linear_smoother_step(
-            after,
-            prior,
-            plant.transition_matrix(u),
-            process,
-            observed_of,
-            innovation.value,
-            innovation.covariance,
-            self.claim,
-        )
-        return replace(step, angles=plant.angles)
+            return super().smoother_step(step)
+        plant, sensor, channel = at((self.plant, self.sensor, self.channel), step.k)
+        u = jnp.asarray(step.u)
+        output = observed_through(channel.mean_gain, sensor.matrix)
+        return linear_smoother_step(step, (plant.transition_matrix(u), plant.noise_covariance(u), output), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

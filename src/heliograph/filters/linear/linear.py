@@ -19,7 +19,7 @@ from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
@@ -122,30 +122,19 @@ class LinearFilter(AbstractSizedFilter):
         """Mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def smoother_step(
-        self,
-        before: LinearBelief,
-        prior: LinearBelief,
-        after: LinearBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update itself, or the moments around it where E[G] is uncertain."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        transition = at(self.plant, k).transition_matrix(jnp.asarray(u))
+        (plant, sensor, channel), u = at((self.plant, self.sensor, self.channel), step.k), jnp.asarray(step.u)
+        transition = plant.transition_matrix(u)
         if not self.mean_known:
-            cross = before.covariance @ transition.T
-            return moments_smoother_step(after, prior, cross, "nominal")
-        total = innovation.covariance
+            return moments_smoother_step(step.after, step.prior, step.before.covariance @ transition.T, "nominal")
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
-            y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-            total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        # F = A, H = M C, process noise Q.
+            y = signal(step.prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+            total = known_gain_covariance(y, channel, ~jnp.isnan(jnp.asarray(step.z)))
+            step = step._replace(innovation=replace(step.innovation, covariance=total))
+        # F = A, process noise Q, H = M C.
         output = observed_through(channel.mean_gain, sensor.matrix)
-        process = at(self.plant, k).noise_covariance(jnp.asarray(u))
-        return linear_smoother_step(after, prior, transition, process, output, innovation.value, total, self.claim)
+        return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

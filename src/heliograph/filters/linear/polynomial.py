@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.polynomial import memory_system
 from heliograph.linear.recursion import lmmse
@@ -163,20 +163,12 @@ class PolynomialFilter(AbstractSizedFilter):
         """Estimate of the inner filter after step k, plus the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
-    def smoother_step(
-        self,
-        before: Centred,
-        prior: Centred,
-        after: Centred,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
-        z = _without_mean(self.centre, z, prior.mean, k)
-        inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
-        return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
+        z = monomials(_without_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
+        before, prior, after = (state.inner for state in step[:3])
+        inner = step._replace(before=before, prior=prior, after=after, z=z)
+        return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute the inner filter."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import corrected, signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -20,8 +20,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import mixed_innovation
 from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -229,20 +228,9 @@ class MultipleModelFilter(AbstractSizedFilter):
         whole = _whole(state)
         return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
 
-    def smoother_step(
-        self,
-        before: ModalBeliefs,
-        prior: ModalBeliefs,
-        after: ModalBeliefs,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of the whole mixture around the update; modes are not smoothed."""
-        local = _whole(before)
-        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
-        return moments_smoother_step(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
+        return moments_around(self, step, _whole)
 
 
 def _whole(state: ModalBeliefs) -> Belief:
