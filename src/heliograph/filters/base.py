@@ -242,9 +242,6 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     """Return z as a measurement of the filter's length, NaN where a component did not arrive.
 
     Empty for a filter that uses no measurements.
-
-    Raises:
-        ValueError: another shape, infinite values, or no real numbers.
     """
     result = _numbers("measurement", z, item.received or None)
     if isinstance(result, np.ndarray) and np.isinf(result).any():
@@ -253,11 +250,7 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
 
 
 def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
-    """Return u as an input of the filter's length.
-
-    Raises:
-        ValueError: another shape, values that are not finite, or no real numbers.
-    """
+    """Return u as an input of the filter's length."""
     result = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
     if isinstance(result, np.ndarray) and not np.isfinite(result).all():
         raise fail("inputs", "finite numbers", np.asarray(result).tolist())
@@ -265,11 +258,7 @@ def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
 
 
 def step_number(item: AbstractFilter, k: Step) -> Step:
-    """Return k as the number of a step that the filter covers.
-
-    Raises:
-        ValueError: no whole number, a negative one, or one past the end of what varies over time.
-    """
+    """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k
     if (

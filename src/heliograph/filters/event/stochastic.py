@@ -98,8 +98,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        size = initial_size(at(self.plant, 0))
         belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
         result, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
         came = join(Parts(safe_log(weight), result.mean, result.covariance, jnp.eye(len(weight))[:, None]))

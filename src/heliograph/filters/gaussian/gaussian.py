@@ -1,7 +1,5 @@
 """Gaussian filter: mean and covariance by a transform (cubature, Jacobian), on the channel's second moments."""
 
-from typing import TypeVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +17,7 @@ from heliograph.filters.smoother_step.building import linear_smoother_step, obse
 from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, continued, nearest
@@ -27,11 +25,8 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
 from heliograph.random_affine.outliers import is_bounded
-
-Element = TypeVar("Element", AbstractRandomAffine, SecondOrder)
 
 
 class GaussianFilter(AbstractBeliefFilter):
@@ -57,7 +52,7 @@ class GaussianFilter(AbstractBeliefFilter):
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         unknown = signal.about_mean() if self.linear else signal
-        size = initial_size(self.initial_mean, self.initial_covariance)
+        size = initial_size(self)
         link, z = at(self.channel, k), jnp.asarray(z)
         return corrected(state, signal, link, self.rule, z, size, self.observed_angles, unknown)
 
@@ -123,9 +118,8 @@ def _use(
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
     """Second moments of the channel in the form of the update, for each step where it varies."""
-    if isinstance(channel, OverTime):
-        return over_time([update.describe(c) for c in unstack(channel)])
-    return update.describe(channel)
+    result: SecondOrder | OverTime = at_each_step(update.describe, channel)
+    return result
 
 
 def _build(
@@ -148,7 +142,7 @@ def _build(
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
-    pairs = zip(_over_steps(channel), _over_steps(described), strict=True)
+    pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
@@ -169,10 +163,6 @@ def _build(
         inputs=start.inputs,
         received=first(channel).outputs,
     )
-
-
-def _over_steps(item: Element | OverTime) -> list[Element]:
-    return unstack(item) if isinstance(item, OverTime) else [item]
 
 
 def gaussian_filter(

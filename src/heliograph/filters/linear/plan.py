@@ -120,9 +120,6 @@ def plan(
 
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
     `projection` (n, N) maps the filter's mean to the plant's states.
-
-    Raises:
-        ValueError: inputs of another number than the filter's.
     """
     return _plan(filter, array("inputs", inputs, (None, len(filter.inputs))), projection)
 

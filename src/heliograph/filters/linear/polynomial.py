@@ -51,7 +51,7 @@ class Centre(Module):
 
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
     """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
-    plants, sensors, channels = _over_steps(plant), _over_steps(sensor), _over_steps(channel)
+    plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
     if not all(has_known_gain(c) for c in channels):
         return None
     drifts = [np.asarray(p.noise_mean()) for p in plants]
@@ -72,10 +72,6 @@ def without_mean(plant: AnyPlant) -> AnyPlant:
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
     return LinearPlant(plant.matrix, about_mean(plant.noise), np.zeros(n), law, plant.input_matrix, plant.states)
-
-
-def _over_steps(item: Part | OverTime) -> list[Part]:
-    return unstack(item) if isinstance(item, OverTime) else [item]
 
 
 def _matrix(item: AbstractPlant | AbstractSensor) -> np.ndarray:
@@ -366,5 +362,4 @@ def claim_of(channel: Channel) -> Claim:
     """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
     if first(channel).remembers:
         return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
-    items: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
-    return "exact" if all(c.corner_count() == 1 for c in items) else "nominal"
+    return "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"

@@ -47,12 +47,7 @@ class Component(NamedTuple):
 
 
 def atoms_of(item: AbstractRandomAffine) -> list[Component]:
-    """All combinations of the atoms of a map's gains and noises.
-
-    Raises:
-        ValueError: a gain that is not discrete, a noise that is neither finite nor Gaussian, or a map of unknown kind;
-            more than COMPONENT_LIMIT combinations.
-    """
+    """All combinations of the atoms of a map's gains and noises."""
     match item:
         # z = g H y + n: every gain with every noise.
         case GainAndNoise():

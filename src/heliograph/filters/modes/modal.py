@@ -299,5 +299,4 @@ def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
 
 def claim_of_modes(channel: Channel) -> Claim:
     """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
-    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
-    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"
+    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"

@@ -79,13 +79,8 @@ def receive(
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
-    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step if it varies.
-
-    Raises:
-        ValueError: too many modes, maps whose moments are unknown, a mode whose output is certain among others: a
-            probability cannot be weighed against densities.
-    """
-    steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step."""
+    steps = [joint_modes(c, nodes) for c in unstack(channel)]
     no_flags = np.ones((len(steps[0].initial), 1))
     parts = by_pattern(steps, no_flags)
     for part in parts if len(no_flags) > 1 else []:
@@ -215,8 +210,8 @@ class MultipleModelFilter(AbstractSizedFilter):
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        start, chance = at(self.plant, 0), state.weight[i, j]
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        chance = state.weight[i, j]
+        size = initial_size(at(self.plant, 0))
         after, weight, mixed = receive(belief, signal, channel, jnp.asarray(j), chance, z, size, self.observed_angles)
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
         (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
@@ -250,9 +245,6 @@ def link_by_mode(
     """Return the plant at the start, received angles, the modes' initial law, and the channel by mode.
 
     A gain that drifts has `nodes` modes.
-
-    Raises:
-        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
     """
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
