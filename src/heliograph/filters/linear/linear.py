@@ -162,10 +162,9 @@ def corrected_linear(
     state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, size: jax.Array
 ) -> tuple[LinearBelief, Innovation]:
     """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
-    matrix, noise = jnp.asarray(sensor.matrix), sensor.noise
-    before = signal(state[1:], matrix, noise.mean, noise.covariance)
-    before = before._replace(matrix=matrix, noise=jnp.asarray(noise.covariance))
-    now = before._replace(mean=matrix @ state.mean + noise.mean)
+    matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
+    before = signal(state[1:], matrix, mean, noise)._replace(matrix=matrix, noise=noise)
+    now = before._replace(mean=matrix @ state.mean + mean)
     after, innovation = corrected(Belief(*state[:2]), now, channel, rule, z, size, unknown=before)
     return state._replace(mean=after.mean, covariance=after.covariance), innovation
 
