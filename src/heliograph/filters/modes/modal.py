@@ -17,7 +17,7 @@ from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -87,9 +87,8 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
-        of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ output_rounding(at(self.sensor, k).matrix, size), axis=0)
+        of_outputs = output_rounding(at(self.sensor, k).matrix, initial_size(at(self.plant, 0)))
+        of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
         return of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
@@ -160,30 +159,12 @@ class ModalFilter(AbstractModalFilter):
         observed, common = without_common(gains @ measure, law)
         return joined(observed), added, common, self.rounding(gains, random, k)
 
-    def smoother_step(
-        self,
-        before: ModalBelief,
-        prior: ModalBelief,
-        after: ModalBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update of zeta."""
-        output = self._observe(prior, k)[0]
-        step, move, noise, _, rows = self._moves(before, u, k)
-        return linear_smoother_step(
-            after,
-            prior,
-            step,
-            _spread_of_moves(before.moments, move, noise, rows)[1],
-            output,
-            innovation.value,
-            innovation.covariance,
-            self.claim,
-            self._projection(),
-        )
+        output = self._observe(step.prior, step.k)[0]
+        transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
+        process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
+        return linear_smoother_step(step, (transition, process, output), self.claim, self._projection())
 
 
 def _spread_of_moves(
@@ -235,7 +216,7 @@ def linear_observation(
 
 def mean_rounding(start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array) -> jax.Array:
     """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
-    n, size = len(start.initial_mean), initial_size(start.initial_mean, start.initial_covariance)
+    n, size = len(start.initial_mean), initial_size(start)
     projection = sum_of_modes(n, len(law))
     left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
     return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size) - left))
@@ -346,5 +327,4 @@ def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
 
 def claim_of_modes(channel: Channel) -> Claim:
     """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
-    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
-    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"
+    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"
