@@ -84,10 +84,10 @@ def fit_each(
     if any(item.start.ndim for item in parameters.every):
         raise fail("free numbers", "single ones", [item.name for item in parameters.every if item.start.ndim])
     # the form, and the data
-    known: Sequence[Objective] = objectives(description)
-    chosen = [item for item in known if form in (None, item.form)]
+    forms: Sequence[Objective] = objectives(description)
+    chosen = [item for item in forms if form in (None, item.form)]
     if not chosen:
-        raise fail("form", f"one of {', '.join(item.form for item in known)}", shown(form))
+        raise fail("form", f"one of {', '.join(item.form for item in forms)}", shown(form))
     z = array("measurements", measurements, (None, None, None), missing=True)
     count = len(description.start.inputs)
     u = np.zeros((z.shape[1], 0)) if inputs is None else array("inputs", inputs, (z.shape[1], count))
@@ -105,11 +105,11 @@ def fit_each(
     # climb from the start in every recording
     best = maximise(evaluate, np.repeat(parameters.start[None], len(z), axis=0))
     top = outcome(best.x)
-    local = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
-    inside = best.converged & np.all(local > SEEN, axis=1)
+    curvature = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
+    inside = best.converged & np.all(curvature > SEEN, axis=1)
     hessian = np.asarray(top.halves).sum(axis=1)
     # Hessian by central differences of the scores; the information where it is not concave
-    width = DIFFERENCE / np.sqrt(np.maximum(local, SEEN))
+    width = DIFFERENCE / np.sqrt(np.maximum(curvature, SEEN))
     slopes = np.empty(hessian.shape)
     for i in range(best.x.shape[1]):
         shift = np.zeros(best.x.shape)

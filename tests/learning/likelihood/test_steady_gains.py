@@ -64,7 +64,7 @@ def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("both", [walk], indirect=True)
-def test_where_gains_do_not_settle_the_scan_is_taken(both):
+def test_where_gains_have_no_steady_state_the_scan_is_taken(both):
     """With hardly any plant noise the covariance falls as 1/k."""
     quick, plain, data = both
     x = np.stack([quick.description.parameters.start] * 3)
