@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from typing_extensions import TypeAliasType
+
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, failure, write_failures
 from heliograph.campaign.plan import Campaign
@@ -30,7 +32,7 @@ from heliograph.numerics.check import check_count, fail, file_path, instance
 from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
-Progress = Callable[[str, int, int], None]
+Progress = TypeAliasType("Progress", Callable[[str, int, int], None])
 Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, and how many are done
 
 
