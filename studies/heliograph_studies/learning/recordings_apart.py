@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from heliograph.codegen.engine import chosen
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
@@ -68,7 +69,7 @@ def fit_each(
 ) -> FitEach:
     """Fit each of many recordings of one length by itself, from the network's start, in one compiled program.
 
-    For studies: as `fit`, without its other starts and sentences, for free numbers that are single.
+    As `fit`, without its other starts and sentences, for free numbers that are single.
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
@@ -84,19 +85,21 @@ def fit_each(
     if any(item.start.ndim for item in parameters.every):
         raise fail("free numbers", "single ones", [item.name for item in parameters.every if item.start.ndim])
     # the form, and the data
-    forms: Sequence[Objective] = objectives(description)
-    chosen = [item for item in forms if form in (None, item.form)]
-    if not chosen:
-        raise fail("form", f"one of {', '.join(item.form for item in forms)}", shown(form))
+    known: Sequence[Objective] = objectives(description)
+    fitting = [item for item in known if form in (None, item.form)]
+    if not fitting:
+        raise fail("form", f"one of {', '.join(item.form for item in known)}", shown(form))
     z = array("measurements", measurements, (None, None, None), missing=True)
     count = len(description.start.inputs)
     u = np.zeros((z.shape[1], 0)) if inputs is None else array("inputs", inputs, (z.shape[1], count))
-    objective = chosen[-1]
+    objective = fitting[-1]
 
     def outcome(x: np.ndarray) -> Evaluation:
         with jax.enable_x64(True):
-            result: Evaluation = to_numpy(_evaluate_each(objective, x, z, u))
-        return result
+            choice = chosen(one_recording, (objective, x, z, u), [False, True, True, False])
+            if choice.code is None:
+                return to_numpy(_by_xla(objective, x, z, u))  # type: ignore[no-any-return]
+            return choice.results()  # type: ignore[no-any-return]
 
     def evaluate(x: np.ndarray) -> Evaluated:
         at = outcome(x)
@@ -105,11 +108,11 @@ def fit_each(
     # climb from the start in every recording
     best = maximise(evaluate, np.repeat(parameters.start[None], len(z), axis=0))
     top = outcome(best.x)
-    curvature = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
-    inside = best.converged & np.all(curvature > SEEN, axis=1)
+    local = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
+    inside = best.converged & np.all(local > SEEN, axis=1)
     hessian = np.asarray(top.halves).sum(axis=1)
     # Hessian by central differences of the scores; the information where it is not concave
-    width = DIFFERENCE / np.sqrt(np.maximum(curvature, SEEN))
+    width = DIFFERENCE / np.sqrt(np.maximum(local, SEEN))
     slopes = np.empty(hessian.shape)
     for i in range(best.x.shape[1]):
         shift = np.zeros(best.x.shape)
@@ -122,6 +125,6 @@ def fit_each(
 
 
 @quickly_compiled
-def _evaluate_each(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+def _by_xla(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
     evaluation: Evaluation = jax.vmap(lambda point, item: one_recording(objective, point, item, u))(x, z)
     return evaluation
