@@ -192,7 +192,7 @@ def test_bounds_under_bursts(fail, recover, bound):
 
 
 def test_links_with_shared_fading_fail_together():
-    """Two sensors: on chains of their own both are silent for long with rho 0.5^2, in one shadow with rho 0.5."""
+    """Two sensors: on chains of their own both are silent for long with rho 0.5^2, with one fading state rho 0.5."""
     sensor = hg.LinearSensor([[1.0]], 1.0)
     local = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))
     shared = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5, "hill")), (sensor, bursts(0.2, 0.5, "hill")))

@@ -283,11 +283,7 @@ def backwards_text(clock: np.ndarray, row: int) -> str:
 
 
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
-    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity.
-
-    Raises:
-        ValueError: wrong shape, not finite, not symmetric, or with a negative eigenvalue.
-    """
+    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
     report_covariance(name, value)
     result = _numbers(name, value)
     # A scalar c stands for c I.

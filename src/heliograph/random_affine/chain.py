@@ -222,11 +222,7 @@ class Autoregression(AbstractMemory):
 
 
 def stationary(transition: Rows) -> Law:
-    """The law p = p Pi of a chain that has only one.
-
-    Raises:
-        ValueError: more than one.
-    """
+    """The law p = p Pi of a chain that has only one."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:

@@ -4,7 +4,7 @@ One component after another on a root of the covariance: of two precise componen
 H P H' + N resolves neither their difference nor N.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -140,10 +140,17 @@ def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
 
 
-def initial_size(mean: Array, covariance: Array) -> Float[jax.Array, " n"]:
+class HasStart(Protocol):
+    """A plant, or a filter that starts from another law."""
+
+    initial_mean: Array
+    initial_covariance: Array
+
+
+def initial_size(item: HasStart) -> Float[jax.Array, " n"]:
     """E[x_i^2] before the first step, (n,)."""
-    mean = jnp.asarray(mean)
-    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(covariance))
+    mean = jnp.asarray(item.initial_mean)
+    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(item.initial_covariance))
     return seconds
 
 

@@ -256,7 +256,7 @@ def side_information_filter(
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     # P(flag | mode); one flag that is always the same where there are none.
-    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(c) for c in unstack(channel)]
     modes = len(steps[0].initial)
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):
