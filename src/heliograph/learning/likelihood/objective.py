@@ -1,24 +1,24 @@
 """Objective of a fit: the likelihood of all nodes together as a function of the free numbers, scores, information."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import chosen
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
-from heliograph.filters.linear.linear import LinearFilter, linear_filter
+from heliograph.filters.linear.linear import linear_filter
+from heliograph.filters.rows import over_rows
 from heliograph.learning.description import Description
-from heliograph.learning.likelihood import steady_gains
 from heliograph.model.channel import Channel, parallel
-from heliograph.model.clock import joint_sensor
+from heliograph.model.enlarged import joint_sensor
+from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import nearest
@@ -67,9 +67,8 @@ def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    if isinstance(channel, OverTime):
-        return over_time([arrived(item) for item in unstack(channel)])
-    return arrived(channel)
+    result: Channel = at_each_step(arrived, channel)
+    return result
 
 
 Form = Literal["linear", "conditional", "truth"]
@@ -86,11 +85,6 @@ class Data(NamedTuple):
     inputs: Float[np.ndarray, "recordings steps inputs"]
     lengths: tuple[int, ...]
     truth: Float[np.ndarray, "recordings steps n"] | None = None
-
-    @property
-    def plain(self) -> bool:
-        """True if everything arrived, and there are no inputs."""
-        return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
 class Evaluation(NamedTuple):
@@ -134,14 +128,10 @@ class Objective:
     Args:
         description: the network with its free numbers.
         form: "linear" or "conditional", the measurements' likelihood; "truth", the density of the true states.
-        steady: true for a `LinearFilter` of which nothing varies over time, so that its gains reach a steady state.
-        random: true if gains are random, so that gains of the filter depend on the state's second moment.
     """
 
     description: Description
     form: Form
-    steady: bool
-    random: bool
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Objective) and same(self._parts(), other._parts())
@@ -158,36 +148,21 @@ class Objective:
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
-        item = self.filter(x)
-
-        def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
-            k, z_k, u_k = row
-            after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
-            return after, (jnp.asarray(innovation.value), jnp.asarray(innovation.covariance))
-
-        start = jax.tree.map(jnp.asarray, item.init())
-        result: tuple[jax.Array, jax.Array] = jax.lax.scan(
-            body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u))
-        )[1]
+        result: tuple[jax.Array, jax.Array] = over_rows(
+            self.filter(x), z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
+        )
         return result
 
     def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
         """Errors of the estimates (steps, n), NaN where the truth is not known, and what is claimed (steps, n, n)."""
-        item, plant = self.filter(x), first(self.description.start.plant)
-        places = np.array([self.description.start.states.index(name) for name in item.states])
-        angles = tuple(i for i, place in enumerate(places) if place in plant.angles)
+        item, angles = self.filter(x), first(self.description.start.plant).angles
 
-        def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
-            k, z_k, u_k, true = row
-            after, _ = item.correct(item.predict(state, u_k, k), z_k, k)
-            estimate = item.estimate(after)
-            mean, covariance = jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
-            return after, (nearest(true, mean, angles) - mean, covariance)
+        def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            estimate = item.estimate(state)
+            return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
-        start = jax.tree.map(jnp.asarray, item.init())
-        rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(truth)[:, places]
-        result: tuple[jax.Array, jax.Array] = jax.lax.scan(body, start, rows)[1]
-        return result
+        mean, covariance = over_rows(item, z, u, claimed)
+        return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
 def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
@@ -200,12 +175,10 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
     Raises:
         ValueError: a network whose likelihood no filter here knows.
     """
-    built = network.start
     if by_truth:
-        sole_filter(built)
-        return [Objective(network, "truth", False, False)]
-    forms, steady = forms_of(built), _is_steady(built)
-    return [Objective(network, form, steady and form == "linear", len(forms) > 1) for form in forms]
+        sole_filter(network.start)
+        return [Objective(network, "truth")]
+    return [Objective(network, form) for form in forms_of(network.start)]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -222,13 +195,6 @@ def forms_of(network: Network) -> list[Form]:
     return ["linear", "conditional"]
 
 
-def _is_steady(network: Network) -> bool:
-    """Decide whether the linear filter is one without memory or delay, of which nothing varies over time."""
-    world = joint_world(network)
-    item = first(world[2])
-    return not item.remembers and not item.past and not any(isinstance(part, OverTime) for part in world)
-
-
 def filter_of(network: Network, form: Form) -> AbstractFilter:
     """Filter of all that the network's nodes receive, whose likelihood is of this form; "truth": the network's own."""
     if form == "truth":
@@ -240,15 +206,15 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 
 
 def sole_filter(network: Network) -> AbstractFilter:
-    """Only filter of a network, of all that arrives.
+    """Only filter of a network, of all that arrives and of all states.
 
     Raises:
-        ValueError: none, several, or one that claims no covariance.
+        ValueError: none, several, one of a part of the states, or one that claims no covariance.
     """
     nodes = list(network.nodes.values())
     local = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
     items = [*local.values(), *(item for item in network.fused.values() if isinstance(item, AbstractFilter))]
-    if len(items) != 1:
+    if len(items) != 1 or items[0].states != network.states:
         expected = "one filter, of all that arrives, whose estimates are compared with them"
         raise fail("network to be learned by its true states", expected, len(items) or "none")
     if items[0].claim == "none":
@@ -256,87 +222,63 @@ def sole_filter(network: Network) -> AbstractFilter:
     return items[0]
 
 
-def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
-    """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
-
-    Where gains reach a steady state, one at a time: there is enough to do in parallel within a recording.
-    """
-    every: dict[int, Evaluation] = {}
+def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
+    """Likelihood, scores and information at points of the line: native code, all points side by side, or XLA."""
+    rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
     with jax.enable_x64(True):
-        for i, point in enumerate(x if objective.steady and data.plain else ()):
-            result, converged = to_numpy(_with_steady_gains(objective, point, data.measurements))
-            if converged:
-                every[i] = result
-        left = [i for i in range(len(x)) if i not in every]
-        for begin in range(0, len(left), lanes):
-            places = left[begin : begin + lanes]
-            full = x[places + places[-1:] * (lanes - len(places))]
-            result = to_numpy(_at_points(objective, full, data.measurements, data.inputs, data.truth))
-            every |= {i: Evaluation(*(leaf[lane] for leaf in result)) for lane, i in enumerate(places)}
-    return Evaluation(*(np.stack(item) for item in zip(*(every[i] for i in range(len(x))), strict=True)))
+        parts = [_at_points(objective, x, *row) for row in zip(*rows, strict=True)]
+    density, score, halves = zip(*parts, strict=True)
+    return Evaluation(np.stack(density, axis=1), np.stack(score, axis=1), np.sum(halves, axis=0))
 
 
-@quickly_compiled
-def _at_points(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None) -> Evaluation:
-    evaluation: Evaluation = jax.vmap(lambda point: all_recordings(objective, point, z, u, truth))(jnp.asarray(x))
-    return evaluation
-
-
-@quickly_compiled
-def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evaluation, jax.Array]:
-    def numbers(x: Array) -> PyTree:
-        return eqx.filter(objective.filter(x), eqx.is_inexact_array)
-
-    item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
-    slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
-    assert isinstance(item, LinearFilter)  # as of every steady objective
-    received, derivatives, converged = steady_gains.innovations(item, slopes, z, objective.random)
-    scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
-    result = Evaluation(
-        *scored(received.value, received.covariance, derivatives.value, derivatives.covariance, jnp.asarray(z))
-    )
-    return result._replace(halves=jnp.sum(result.halves, axis=0)), converged
-
-
-def all_recordings(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None) -> Evaluation:
-    """Evaluation at one point: density (recordings, steps), score (recordings, steps, p), halves (2, p, p)."""
-    result = jax.vmap(partial(one_recording, objective, x))(*jax.tree.map(jnp.asarray, (z, u, truth)))
-    return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
+def _at_points(objective: Objective, x: np.ndarray, *rows: np.ndarray) -> Evaluation:
+    """Evaluate one recording at points, (points, ...)."""
+    choice = chosen(one_recording, (objective, x, *rows), [False, True, *(False for _ in rows)])
+    if choice.code is not None:
+        return choice.results()  # type: ignore[no-any-return]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *(to_numpy(_by_xla(objective, point, *rows)) for point in x))  # type: ignore[no-any-return]
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
-    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p).
+    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward.
 
-    s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
-    components that arrived; derivatives run forward through the scan. With the true states e is the error of the
-    estimates and S what they claim.
+    With the true states e is the error of the estimates and S what they claim.
     """
-    compared = z if truth is None else truth
-    local = (
-        partial(objective.innovations, z=z, u=u) if truth is None else partial(objective.errors, z=z, u=u, truth=truth)
-    )
-    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
-    return Evaluation(*_scored(e, s, de, ds, jnp.asarray(compared)))
+
+    def local(x: Array) -> tuple[jax.Array, jax.Array]:
+        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
+
+    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 1))(jnp.eye(len(x)))
+
+    def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        k, *innovation = row
+        density, score, information = _scored(*innovation)
+        late = jnp.stack([k < len(z) // 2, k >= len(z) // 2])[:, None, None]
+        return halves + jnp.where(late, information, 0.0), (density, score)
+
+    rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z if truth is None else truth)
+    halves, (density, score) = jax.lax.scan(step, jnp.zeros((2, len(x), len(x))), rows)
+    return Evaluation(density, score, halves)
+
+
+_by_xla = quickly_compiled(one_recording)
 
 
 def _scored(
     e: jax.Array, s: jax.Array, de: jax.Array, ds: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    p, steps, m = de.shape
-    e, z, s = e.T, z.T[:m], jnp.moveaxis(s, 0, -1)  # time last, as the kernels of small matrices want it
-    de, ds = jnp.moveaxis(de, (0, 1), (1, 2)), jnp.moveaxis(ds, (0, 1), (2, 3))
-    # components that arrived, and the log-density of their innovation
+    """Log-density, score and information of an innovation e (m,) and its covariance, with derivatives (p, ...).
+
+    -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, of what arrived.
+    """
+    p, m = de.shape
     present = ~jnp.isnan(e)
     both = present[:, None] & present
-    density = log_density(e, s, jnp.abs(z) + jnp.abs(z - e))
+    density = log_density(e, s, jnp.abs(z[:m]) + jnp.abs(z[:m] - e))
     e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
-    de, ds = jnp.where(present[:, None], de, 0.0), jnp.where(both[:, :, None], ds, 0.0)
-    # S^-1 (e, de, dS) by one factorisation, then score and information
-    right = jnp.concatenate([e[:, None], de, jnp.reshape(jnp.swapaxes(ds, 1, 2), (m, p * m, steps))], axis=1)
-    solved = solve(s, right)
-    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m, steps)  # S^-1 (e, de, dS)
-    score = jnp.einsum("iak,ik->ka", -de, w) - jnp.einsum("iaik->ka", q) / 2
-    score = score + jnp.einsum("ik,ijak,jk->ka", w, ds, w) / 2
-    late = jnp.stack([jnp.arange(steps) < steps // 2, jnp.arange(steps) >= steps // 2]).astype(e.dtype)
-    halves = jnp.einsum("hk,iak,ibk->hab", late, de, v) + jnp.einsum("hk,iajk,jbik->hab", late, q, q) / 2
-    return density, score, halves
+    de, ds = jnp.where(present, de, 0.0), jnp.where(both, ds, 0.0)
+    # S^-1 (e, de, dS) by one factorisation
+    solved = solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
+    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
+    score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
+    return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2

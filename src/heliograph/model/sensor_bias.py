@@ -1,4 +1,4 @@
-"""Plants driven by a dynamical bias, and sensors whose errors have memory."""
+"""Sensors whose errors have memory: biases of their outputs as states."""
 
 from typing import Any
 
@@ -6,53 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.enlarged import with_bias
 from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
-from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor
-from heliograph.numerics.check import array, fail, instance, rank, scalar
+from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
+from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.traced import is_traced, library, scipy_for
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Vector
-
-
-def with_bias(plant: LinearPlant, coupling: "Float[ArrayLike, 'n bias']", bias: LinearPlant) -> LinearPlant:
-    """Return the plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
-
-    Every filter of the result estimates both. A name that the plant has too gets the prefix "bias_".
-
-    Args:
-        plant: the plant of x (n states).
-        coupling: E (n, bias states).
-        bias: the plant of b, without inputs, independent of the first.
-
-    Raises:
-        ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
-    Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
-    """
-    for what, item in (("plant with bias", plant), ("bias", bias)):
-        instance(what, item, LinearPlant, "a LinearPlant")
-    n, extra = len(plant.states), len(bias.states)
-    coupling = array("coupling of the bias", coupling, (n, extra))
-    if bias.inputs:
-        raise fail("bias", "a plant without inputs", list(bias.inputs))
-    # (w, xi) and the two initial states are independent.
-    noises = [p.noise for p in (plant, bias) if isinstance(p.noise, AbstractNoise)]
-    if len(noises) < 2:
-        raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
-    deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
-    centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
-    xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
-    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; 0] u + [w; xi].
-    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
-    return LinearPlant(
-        xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
-        Independent(noises),
-        xp.concatenate(centers),
-        Independent(deviations),
-        xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
-        states=(*plant.states, *renamed.values()),
-        inputs=plant.inputs,
-        circular=(*plant.circular, *(renamed[name] for name in bias.circular)),
-    )
 
 
 def with_sensor_bias(
@@ -82,10 +42,12 @@ def with_sensor_bias(
     instance("plant with sensor biases", plant, AbstractPlant, "one that does not vary")
     instance("sensor with biases", sensor, AbstractSensor, "one that does not vary")
     n, outputs = len(plant.states), len(sensor.outputs)
+    check_sensor(sensor, n)
     matrix = np.eye(outputs) if loading is None else array("loading of the biases", loading, (outputs, "biases"))
     count = matrix.shape[1]
-    size = _of_each("deviation of a bias", deviation, count, 0.0)
-    rate = 1 / _of_each("time of a bias", time, count, 1e-300)
+    sizes = [scalar("deviation of a bias", x, 0.0) for x in _of_each("deviation of a bias", deviation, count)]
+    rates = [_rate(x) for x in _of_each("time of a bias", time, count)]
+    size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
     named = [f"{name}_bias" for name in sensor.outputs] if loading is None else [f"bias{i}" for i in range(count)]
     return _with_states(plant, named, size, rate, dt), _with_loading(sensor, matrix, n)
 
@@ -139,13 +101,16 @@ def _with_states(
     return Plant(move, spread, center, start, (*plant.states, *names), plant.inputs, plant.circular)
 
 
-def _of_each(name: str, value: ArrayLike, count: int, low: float) -> Any:
-    """One number for each bias, (count,), from one or from as many; an infinite time stays."""
+def _of_each(name: str, value: ArrayLike, count: int) -> list[Any]:
+    """Values of the biases, from one or from as many."""
     given: Any = value
-    values = [given] * count if not rank(name, value) else list(given)
+    values = list(given) if rank(name, value) else [given] * count
     if len(values) != count:
         raise fail(name, f"one, or one for each of {count}", len(values))
-    wrong = [x for x in values if not is_traced(x) and not float(x) >= low]
-    if wrong:
-        raise fail(name, "a positive number" if low else "a number of at least 0", f"{float(wrong[0]):g}")
-    return library(*values).stack([library(x).asarray(x) for x in values])
+    return values
+
+
+def _rate(time: Any) -> Any:
+    """1 / T, 0 of an infinite one."""
+    constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
+    return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)
