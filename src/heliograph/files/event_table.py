@@ -74,6 +74,23 @@ class EventTable:
         columns.sequence.append(counted if reading.sequence is None else reading.sequence)
         columns.values.extend(reading.values.tolist())
 
+    def add_many(
+        self,
+        node: str,
+        arrival: Int[np.ndarray, " events"],
+        time: Int[np.ndarray, " events"],
+        sequence: Int[np.ndarray, " events"],
+        values: Float[np.ndarray, "events size"],
+    ) -> None:
+        """Append readings of a node as `add` does one after another; a time or count of -1 is one that is not there."""
+        columns, counted = self.columns[node], len(self.columns[node].time) + np.arange(len(time))
+        sequence = np.where(sequence >= 0, sequence, np.where(time < 0, counted, 0))
+        time = np.where(time < 0, arrival, time)
+        for column, numbers in ((columns.time, time), (columns.arrival, time if self.steps else arrival)):
+            column.frombytes(numbers.tobytes())
+        columns.sequence.frombytes(sequence.tobytes())
+        columns.values.frombytes(values.tobytes())
+
     @property
     def origin(self) -> int:
         """Nanoseconds since 1970 from which the times of the events count; 0 where these are steps.

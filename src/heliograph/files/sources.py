@@ -144,8 +144,8 @@ class Sources:
     def __init__(self, table: object, network: Network):
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.steps = TIME_STEP not in network.inputs
-        self._names = {name: tuple(network.nodes[name].received_names) for name in network.names}
-        self._names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
+        self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", shown(table))
         self._table = {topic: self._checked(topic, items) for topic, items in table.items()}
@@ -179,7 +179,7 @@ class Sources:
         return [self._reading(source, places, message, where) for source, places in sources]
 
     def _reading(self, source: Source, places: np.ndarray, message: object, where: str) -> Reading:
-        values = np.full(len(self._names[source.node]), np.nan)
+        values = np.full(len(self.names[source.node]), np.nan)
         for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
             value = at(message, path, where)
             if type(value) is not float:  # names its place only where there may be something to say
@@ -207,9 +207,9 @@ class Sources:
         return [(source, self._places(f"sources, {topic!r}", source)) for source in sources]
 
     def _places(self, name: str, source: Source) -> np.ndarray:
-        if source.node not in self._names:
-            raise fail(f"{name}, node", f"one of {', '.join(self._names)}", _near(source.node, self._names))
-        known = self._names[source.node]
+        if source.node not in self.names:
+            raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _near(source.node, self.names))
+        known = self.names[source.node]
         outputs = source.outputs or known
         if len(outputs) != len(source.paths):
             raise fail(f"{name}, path", f"{len(known)} paths, for {', '.join(known)}, or output=", len(source.paths))
