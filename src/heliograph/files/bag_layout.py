@@ -42,18 +42,18 @@ class Layout:
         definitions: fields by type of message, as rosbags has them.
         kind: type of the message.
         data: a message.
-        wanted: dotted paths of numbers.
+        paths: dotted paths of the numbers to read.
 
     Raises:
         LayoutError: another encoding, a wanted field that is no number, a message that ends elsewhere.
     """
 
-    def __init__(self, definitions: Any, kind: str, data: bytes, wanted: set[str]):
-        self._definitions, self._data, self._wanted = definitions, data, wanted
+    def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
+        self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
         self._length(0)
         end = self._message(4, kind, "")
-        if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or wanted != self.fields.keys():
+        if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
             raise LayoutError  # a message is filled up to four bytes at most
 
     def fits(self, table: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ class Layout:
             place = _aligned(place, 4)
             count, place = self._length(place), place + 4
         if part.name == "BASE" and inner[0] in NUMBERS:
-            near = any(name.startswith(f"{path}.") for name in self._wanted)
+            near = any(name.startswith(f"{path}.") for name in self._paths)
             return self._numbers(place, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)])
         for i in range(count):
             place = self._field(place, part.name, inner, f"{path}.{i}")
@@ -98,7 +98,7 @@ class Layout:
             raise LayoutError
         place = _aligned(place, size) if count else place
         for i, name in enumerate(names):
-            if name in self._wanted:
+            if name in self._paths:
                 self.fields[name] = place + i * size, kind
         return place + count * size
 
@@ -165,8 +165,8 @@ class Decoder:
         left, place = np.arange(len(table)), 0
         while len(left):
             if place == len(known):
-                wanted = {path for source, _ in self._sources.of(connection.topic) for path in _paths(source)}
-                known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), wanted))
+                paths = {path for source, _ in self._sources.of(connection.topic) for path in _paths(source)}
+                known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[place].fits(table[left])
             yield left[fits], known[place].columns(table[left[fits]])
             left, place = left[~fits], place + 1
