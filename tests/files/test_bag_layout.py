@@ -31,11 +31,13 @@ def messages(count, chance):
         late = at + int(chance.integers(10**9))
         numbers = chance.standard_normal(20).astype(np.float32)
         numbers[chance.integers(20)] = np.nan
-        one, kind = chance.standard_normal(3), chance.integers(3)
-        vector = KINDS["geometry_msgs/msg/Vector3"](*map(float, one))
+        three, kind = chance.standard_normal(3), chance.integers(3)
+        vector = KINDS["geometry_msgs/msg/Vector3"](*map(float, three))
         if kind == 0:
             ranges = numbers[: chance.integers(4, 20)]
-            results.append((late, "/scan", SCAN, KINDS[SCAN](header(at, chance), *one, *one, 0.5, ranges, ranges[:3])))
+            results.append(
+                (late, "/scan", SCAN, KINDS[SCAN](header(at, chance), *three, *three, 0.5, ranges, ranges[:3]))
+            )
         elif kind == 1:
             turn, nine = KINDS["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), chance.standard_normal(9)
             results.append((late, "/imu", IMU, KINDS[IMU](header(at, chance), turn, nine, vector, nine, vector, nine)))

@@ -46,7 +46,8 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         ValueError: no bag, sources that do not fit the network, or none whose topic is in the bag; one line.
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
-    sources, result = Sources(table, network), EventTable(network)
+    sources = Sources(table, network)
+    result = EventTable(network, sources.step)
     with opened(path) as (reader, cut):
         result.broken = cut
         counts = Counter[str]()
@@ -145,6 +146,7 @@ def raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator
 def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
     """Yield messages in lists of bounded size; an error comes after what was read before it."""
     batch, size, failure = list[RawMessage](), 0, None
+    # Up to so many messages or bytes, or to the end.
     while failure is None:
         try:
             message = next(messages, None)

@@ -74,6 +74,7 @@ class Layout:
         return place
 
     def _field(self, place: int, node: str, of: Any, path: str) -> int:
+        # Parts, texts and single numbers.
         if node == "NAME":
             return self._message(place, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
@@ -81,6 +82,7 @@ class Layout:
             return place + 4 + self._length(place)
         if node == "BASE":
             return self._numbers(place, of[0], 1, path, [path])
+        # Lists, of numbers or of anything else.
         (part, inner), count = of
         if node == "SEQUENCE":
             place = _aligned(place, 4)
