@@ -10,7 +10,7 @@ from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event
 from heliograph.numerics.check import TINY, fail, instance, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float, Int
 from heliograph.random_affine.law import Discrete
 from heliograph.simulation.network import Network

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.gaussian_sum import EventFilter
@@ -22,6 +21,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network

@@ -8,14 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.forked import check_process
+from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered

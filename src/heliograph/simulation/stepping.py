@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import Plan
@@ -18,10 +17,9 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail, instance, text
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.centres.centre import (
     Centre,
     CentreState,

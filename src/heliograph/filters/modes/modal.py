@@ -16,7 +16,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -144,30 +144,12 @@ class ModalFilter(AbstractModalFilter):
         observed, common = without_common(gains @ measure, law)
         return joined(observed), added, common
 
-    def smoother_step(
-        self,
-        before: ModalBelief,
-        prior: ModalBelief,
-        after: ModalBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update of zeta."""
-        output, _, _ = self._observe(prior, k)
-        step, move, noise, _, rows = self._moves(before, u, k)
-        return linear_smoother_step(
-            after,
-            prior,
-            step,
-            _spread_of_moves(before.moments, move, noise, rows)[1],
-            output,
-            innovation.value,
-            innovation.covariance,
-            self.claim,
-            self._projection(),
-        )
+        output, _, _ = self._observe(step.prior, step.k)
+        transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
+        process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
+        return linear_smoother_step(step, (transition, process, output), self.claim, self._projection())
 
 
 def _spread_of_moves(
@@ -317,5 +299,4 @@ def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
 
 def claim_of_modes(channel: Channel) -> Claim:
     """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
-    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
-    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"
+    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"

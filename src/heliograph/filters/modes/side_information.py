@@ -23,9 +23,9 @@ from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import symmetric_product
-from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 
 
 class SideInformation(Module):
@@ -256,7 +256,7 @@ def side_information_filter(
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     # P(flag | mode); one flag that is always the same where there are none.
-    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(c) for c in unstack(channel)]
     modes = len(steps[0].initial)
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):

@@ -24,7 +24,7 @@ from heliograph.filters.modes.modal import (
     prior_of_modes,
     without_common,
 )
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
@@ -109,21 +109,13 @@ class UncertainModalFilter(AbstractModalFilter):
         mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
-    def smoother_step(
-        self,
-        before: UncertainBelief,
-        prior: UncertainBelief,
-        after: UncertainBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of zeta around the update; the filter's bound is not proved for smoothed estimates."""
-        move, _, _ = moved_about(at(self.plant, k), u, before.centre)
+        before, k = step.before, step.k
+        move, _, _ = moved_about(at(self.plant, k), step.u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
-        moments = moments_smoother_step(after, prior, cross, "nominal")
+        moments = moments_smoother_step(step.after, step.prior, cross, "nominal")
         return replace(moments, projection=jnp.asarray(self._projection()))
 
 
