@@ -52,7 +52,7 @@ def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
 
 
-def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
+def test_a_run_takes_the_form_that_its_numbers_need():
     """Beside a precise one or alone, a run's bits are the same."""
     plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
 
