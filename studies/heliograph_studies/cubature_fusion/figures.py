@@ -4,7 +4,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
 from heliograph.report.figures import (
     AMBER,
     BLUE,
@@ -21,6 +20,7 @@ from heliograph.report.figures import (
 from heliograph_studies.cubature_fusion.compute import Outcome, Runs
 from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
 from heliograph_studies.cubature_fusion.statements import BETTER, METHOD, TWIN
+from heliograph_studies.curves import Panel, curves_over_time
 
 COLOURS = {
     "open_loop": MUTED, "mean_gain": AMBER, "cubature_printed_fixed": VERMILION, "cubature_printed": PURPLE,

@@ -6,7 +6,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
 from heliograph.report.figures import (
     AMBER,
     BLUE,
@@ -20,6 +19,7 @@ from heliograph.report.figures import (
     WIDTH,
     Curve,
 )
+from heliograph_studies.curves import Panel, curves_over_time
 from heliograph_studies.h_infinity_fusion import structured
 from heliograph_studies.h_infinity_fusion.compute import Outcome
 from heliograph_studies.h_infinity_fusion.discriminating import NODE
