@@ -32,8 +32,7 @@ from heliograph.simulation.results.reducer import (
     trajectories_record,
 )
 from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.consistency import nis_sums, warn_of
-from heliograph.smoothing.modes import AbstractSmoothing
+from heliograph.smoothing.modes import AbstractSmoothing, nis_sums, warn_of
 
 
 class Smoother(Module):

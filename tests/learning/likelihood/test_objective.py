@@ -46,7 +46,7 @@ def points(objective):
 def test_native_code_computes_what_the_compiler_of_jax_does(both):
     objective, data = both
     x = points(objective)
-    found = at_points(objective, x, data)
+    native = at_points(objective, x, data)
     with jax.enable_x64(True):
         for i, point in enumerate(x):
             parts = [_by_xla(objective, point, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
@@ -55,7 +55,7 @@ def test_native_code_computes_what_the_compiler_of_jax_does(both):
                 np.stack([p.score for p in parts]),
                 sum(p.halves for p in parts),
             )
-            for a, b in zip((leaf[i] for leaf in found), expected, strict=True):
+            for a, b in zip((leaf[i] for leaf in native), expected, strict=True):
                 np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
-from heliograph.numerics.small_matrix import squared_distance
+from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import Array
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network
