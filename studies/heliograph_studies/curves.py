@@ -6,10 +6,21 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from heliograph.report.figures import AMBER, INK, MUTED, PALE, STYLE, WIDTH, Curve, label_right
+from heliograph.report.figures import AMBER, INK, MUTED, PALE, STYLE, WIDTH
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A named curve in one colour: values (time,), or (time, 2) for a path; `deviation` alike, if claimed."""
+
+    name: str
+    colour: str
+    values: np.ndarray
+    deviation: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -145,3 +156,15 @@ def graph_map(
     for side in axes.spines.values():
         side.set_visible(False)
     return figure
+
+
+def label_right(axes: Axes, ends: Mapping[str, tuple[float, str]], gap: float = 0.065) -> None:
+    """Name curves at the right edge, at (value, colour), at least `gap` of the axis apart."""
+    to_axes = axes.transData + axes.transAxes.inverted()
+    names = sorted(ends, key=lambda name: ends[name][0])
+    heights = np.array([to_axes.transform((0.0, ends[name][0]))[1] for name in names])
+    for _ in range(100):  # each pass shares what is missing between the two neighbours
+        missing = np.maximum(gap - np.diff(heights), 0.0) / 2
+        heights += np.append(0.0, missing) - np.append(missing, 0.0)
+    for name, height in zip(names, heights, strict=True):
+        axes.text(1.015, height, name, transform=axes.transAxes, va="center", color=ends[name][1], fontsize=9)
