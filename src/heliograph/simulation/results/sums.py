@@ -209,7 +209,8 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
         raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]
     # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
-    result: OfStep = over_runs(_of_run, record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
+    arrays = (np.asarray(part, dtype=float) for part in (record.truth, estimate.mean, estimate.covariance))
+    result: OfStep = over_runs(_of_run, *arrays)
     sums, ever = jax.tree.map(_by_batch, (result.sums, result.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
