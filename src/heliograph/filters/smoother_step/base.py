@@ -105,10 +105,6 @@ class AbstractSmootherStep(Module):
         nothing = jnp.zeros_like(self.covariance)
         return Point(self.mean, self.covariance, unit, nothing, self.covariance, jnp.asarray(False))
 
-    def without_data(self) -> "AbstractSmootherStep":
-        """Return the same step without the parts that only means depend on."""
-        raise NotImplementedError
-
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractSmootherStep":
         """Return the same step with other data of the same arrivals: other means and innovation."""
         raise NotImplementedError
@@ -221,11 +217,6 @@ class LinearSmootherStep(AbstractSmootherStep):
         step = item.covariance, self.transition, self.prior_covariance, earlier.precise
         mean = _mean_before(item.mean, earlier.vector, known.mean - self.prior_mean, *step)
         return Moments(mean, _left(earlier.matrix, self.process, known.covariance, *step))
-
-    def without_data(self) -> AbstractSmootherStep:
-        """Return the step without mean and innovation."""
-        mean, innovation = jnp.zeros_like(self.mean), jnp.zeros_like(self.innovation)
-        return replace(self, mean=mean, prior_mean=mean, innovation=innovation, shift=None, nis=None, received=None)
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
         """Return the step with these means and innovation."""

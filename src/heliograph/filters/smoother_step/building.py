@@ -67,11 +67,6 @@ class MomentsSmootherStep(AbstractSmootherStep):
         after = less(point.covariance, gain, self.prior_covariance - self.covariance)
         return point._replace(mean=point.mean + news, covariance=after, link=gain)
 
-    def without_data(self) -> AbstractSmootherStep:
-        """Return the step without both means."""
-        none = jnp.zeros_like(self.mean)
-        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
-
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
         """Return the step with these means."""
         return replace(self, mean=mean, prior_mean=prior_mean)
