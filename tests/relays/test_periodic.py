@@ -89,7 +89,7 @@ def test_what_has_no_steady_state_is_refused(local):
         periodic_relays_for_best_receiver(alone)
 
 
-def test_descent_finds_the_bottom_of_a_curved_valley_beside_a_cliff():
+def test_descent_finds_the_bottom_of_a_curved_valley_next_to_a_cliff():
     def rosenbrock(x):
         if x[0] > 1.5:
             return np.inf, np.zeros(2)

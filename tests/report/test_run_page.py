@@ -196,7 +196,7 @@ def test_a_doubt_names_its_filter(health):
     assert title.endswith(" about the network: a/sure")
 
 
-def test_numbers_are_rounded_by_their_own_error():
+def test_numbers_are_rounded_by_their_standard_error():
     """Two digits of the standard error, whatever the size of the number."""
     for value, error, text in [
         (12.34567, 0.0123, "12.346"), (0.5, 0.2, "0.50"), (1234.5, 130.0, "1230"), (3.14159, 0.0, "3.142"),

@@ -159,7 +159,7 @@ def test_damage_is_one_line_with_what_to_do():
         ("drop table numbers", "damaged: no table numbers"),
     ],
 )
-def test_damage_beside_the_plants_ends_the_service_in_one_line(whole, tmp_path, mine, how, what):
+def test_damage_outside_the_plants_ends_the_service_in_one_line(whole, tmp_path, mine, how, what):
     place = copy(whole, tmp_path)
     changed(place, how)
     with pytest.raises(InputError, match=what) as error:

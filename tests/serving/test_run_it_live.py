@@ -82,7 +82,7 @@ def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, cap
     )
 
 
-def test_the_state_is_kept_beside_the_network_unless_it_is_said_otherwise(tmp_path, monkeypatch, capfd):
+def test_the_state_is_stored_next_to_the_network_by_default(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Path("net.py").write_text(SMALL)
     Path("sent").write_bytes(b"\n".join(lines(messages(1, 40, 0, whole=True, longest=0.0))))

@@ -254,11 +254,7 @@ def _symmetrised(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
 def scale(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
 ) -> tuple[list[StepMatrices], Coordinates]:
-    """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`.
-
-    Raises:
-        ValueError: a target that is zero at every step.
-    """
+    """Transform the steps to coordinates of order one, near the best predictor's gains or the given `gains`."""
     n, plain = system.states, system.growth.absent and system.output_growth.absent
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     # covariances of x_0 and e_0 from the initial weight

@@ -60,9 +60,6 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
 
     A noise of covariance R counts as rank(R) sources of unit size; its mean is not used. Uncertain probabilities count
     as nominal.
-
-    Raises:
-        ValueError: a channel that is not made of hops, series, mixtures and stacks.
     """
     raise fail("channel", "hops, series, mixtures and stacks of them", type(channel).__name__)
 
@@ -313,11 +310,7 @@ def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """Make a matrix exactly symmetric.
-
-    Raises:
-        ValueError: entries that differ across the diagonal by more than rounding of what they weigh.
-    """
+    """Make a matrix exactly symmetric."""
     unit = own_units(matrix)
     skew = np.abs(matrix - np.swapaxes(matrix, -1, -2))
     if np.any(skew > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):

@@ -38,9 +38,6 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
 
     Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
     `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
-
-    Raises:
-        ValueError: what `lifted_system` refuses, or a schedule whose state is not an estimate of x.
     """
     check_model(plant, sensor, channel)
     start, horizon = first(plant), linear.horizon

@@ -98,11 +98,7 @@ def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tu
 def plant_matrices(
     plant: AnyPlant, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """A and Cov(w) of a constant linear plant, for `what` needs them.
-
-    Raises:
-        ValueError: another plant.
-    """
+    """A and Cov(w) of a constant linear plant, for `what` needs them."""
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
@@ -116,11 +112,7 @@ def plant_matrices(
 def sensor_matrices(
     sensor: AnySensor, states: int, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them.
-
-    Raises:
-        ValueError: another sensor.
-    """
+    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
     check_sensor(sensor, states)

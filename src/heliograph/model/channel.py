@@ -6,7 +6,7 @@ from typing import overload
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant, check_turns
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.angle import Angles
@@ -183,11 +183,13 @@ def mean_gain(channel: Channel) -> Channel:
     Raises:
         ValueError: a gain law that does not know its mean, a channel that remembers.
     """
-    if isinstance(channel, OverTime):
-        return over_time([mean_gain(c) for c in unstack(channel)])
-    as_maps("channel taken at its mean gain", [channel])
-    check_forgets("channel taken at its mean gain", channel)
-    return channel.mean_gain()
+
+    def mean_of(item: AbstractRandomAffine) -> AbstractRandomAffine:
+        check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [item])[0])
+        return item.mean_gain()
+
+    result: Channel = at_each_step(mean_of, channel)
+    return result
 
 
 def check_link(
@@ -216,11 +218,7 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 
 
 def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
-    """Return the indices of received components that are angles; plant, sensor and channel must fit each other.
-
-    Raises:
-        ValueError: a channel that leaves no angle of one, or a sensor whose outputs a full turn of a state changes.
-    """
+    """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     start, senses = first(plant), first(sensor)
     check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
@@ -234,11 +232,7 @@ ROUNDING = 1e-12  # of a gain of 1 that was computed
 
 
 def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
-    """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave an angle one.
-
-    Raises:
-        ValueError: an angle with another gain than 1, or one that is added to something else.
-    """
+    """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave angles."""
     if not sent:
         return ()
     match channel:

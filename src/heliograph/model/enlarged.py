@@ -1,6 +1,7 @@
 """Plants with further states: a dynamical bias, past outputs of the sensor, offset and drift of clocks."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
+from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
@@ -74,11 +75,7 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     """
     check_linear("plant and sensor behind a random delay", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
-    past, steps = first(channel).past, steps_covered((plant, sensor))
-    if not isinstance(plant, OverTime) and not isinstance(sensor, OverTime):
-        moved: AnyPlant = _with_line(plant, sensor, past)
-    else:
-        moved = over_time([_with_line(at(plant, k), at(sensor, k), past) for k in range(steps or 0)])
+    moved: AnyPlant = at_each_step(partial(_with_line, past=first(channel).past), plant, sensor)
     n, total = len(first(plant).states), len(first(moved).states)
     everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
     return moved, everything, of_line(channel)

@@ -188,7 +188,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(item) for item in unstack(channel)]
     return not harmless(steps, not isinstance(channel, OverTime))
 
 

@@ -262,21 +262,13 @@ def advance(
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity in order of appearance.
-
-    Raises:
-        ValueError: one name for memories that differ.
-    """
+    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
     parts = jax.tree.leaves(channel, is_leaf=_is_modal)
     return distinct(part.memory for part in parts if _is_modal(part))
 
 
 def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Memories by what tells them apart, in order of appearance.
-
-    Raises:
-        ValueError: one name for memories that differ.
-    """
+    """Memories by what tells them apart, in order of appearance."""
     results: dict[str, AbstractMemory] = {}
     for memory in held:
         known = results.setdefault(memory.identity, memory)

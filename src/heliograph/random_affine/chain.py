@@ -21,8 +21,8 @@ from heliograph.numerics.check import (
     fail,
     probabilities,
     radii,
+    report_domain,
     scalar,
-    tell,
 )
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library
@@ -123,7 +123,7 @@ class MarkovChain(AbstractMemory):
         name: str | None = None,
         radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
-        tell("transition matrix", transition, SIMPLEX, PROBABILITY)
+        report_domain("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
         if rows.shape[0] != rows.shape[1] or not rows.size:
             raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")
@@ -222,11 +222,7 @@ class Autoregression(AbstractMemory):
 
 
 def stationary(transition: Rows) -> Law:
-    """The law p = p Pi of a chain that has only one.
-
-    Raises:
-        ValueError: more than one.
-    """
+    """The law p = p Pi of a chain that has only one."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:

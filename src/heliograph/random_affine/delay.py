@@ -76,10 +76,6 @@ class Delayed(AbstractOfLine):
         link: the link without delay.
         delay: d in steps; a `Discrete` law from which d is drawn at each step; or a `MarkovChain` whose mode is d.
         timestamped: True if d is received too, as the last number; False unless given.
-
-    Raises:
-        ValueError: a delay that is no whole number of steps from 0, a law of it with other values, a link that is late
-            itself (put links in series with `amplify_and_forward`).
     """
 
     link: AbstractRandomAffine
@@ -247,9 +243,6 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     A relay without memory that stores what it received for a constant d equals one that receives it d steps later:
     gains and noises are independent over time. One that stores it for a random time may forward one value twice, with
     one noise.
-
-    Raises:
-        ValueError: no links, time stamps on the way, memory before a delay.
     """
     links = as_maps("series", links)
     if not any(link.past for link in links):

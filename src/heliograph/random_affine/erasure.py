@@ -40,20 +40,12 @@ class Erasure(AbstractWithBase):
         return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
     def moments(self, order: int) -> Moments:
-        """Refuse: a filter skips lost packets, and asks for the moments of the channel inside.
-
-        Raises:
-            ValueError: always.
-        """
+        """Refuse: a filter skips lost packets, and asks for the moments of the channel inside."""
         raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
 
 
 def arrived(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel given that everything arrives, where losses are independent of gains.
-
-    Raises:
-        ValueError: losses that depend on which of several channels was drawn.
-    """
+    """Return the channel given that everything arrives, where losses are independent of gains."""
     if not channel.erases:
         return channel
     match channel:
@@ -78,12 +70,7 @@ class Outcome(NamedTuple):
 
 
 def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
-    """List every set of losses of a channel without memory; outcomes of probability 0 are left out.
-
-    Raises:
-        ValueError: a channel that remembers, erasures inside a map that is no series or stack, more than OUTCOME_LIMIT
-            outcomes.
-    """
+    """List every set of losses of a channel without memory; outcomes of probability 0 are left out."""
     check_forgets("channel with erasures", channel)
     if not channel.erases:
         return [Outcome(1.0, channel, np.ones(channel.outputs, dtype=bool))]

@@ -267,9 +267,6 @@ def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """The channel with its modes drawn anew at each step, by their law in the long run; moments up to order 4 are kept.
 
     A channel without memory is itself.
-
-    Raises:
-        ValueError: a map inside that remembers in a way of its own.
     """
     if not channel.remembers:
         return channel

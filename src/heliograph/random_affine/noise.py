@@ -226,11 +226,7 @@ NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a co
 
 
 def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
-    """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise.
-
-    Raises:
-        ValueError: not a covariance, or a law of another dimension.
-    """
+    """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise."""
     if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)

@@ -102,11 +102,7 @@ def split_gains(
 
 
 def as_design(network: RelayNetwork, result: Propagated) -> RelayDesign:
-    """Name the parts of a propagation.
-
-    Raises:
-        ValueError: moments that are not finite: an innovation moment is singular, or gains diverge.
-    """
+    """Name the parts of a propagation."""
     moments, n = np.asarray(result.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
@@ -247,11 +243,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Block matrices of the relays' gains, zero for the receiver.
-
-    Raises:
-        ValueError: a relay without gains, gains of the wrong shape, no relays.
-    """
+    """Block matrices of the relays' gains, zero for the receiver."""
     gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:

@@ -36,11 +36,7 @@ SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relati
 
 
 def periodic_steps(network: RelayNetwork) -> Steps:
-    """Return the steps of one period, at the stationary mean of the state.
-
-    Raises:
-        ValueError: parts that vary beyond the slots, or a plant whose mean does not converge.
-    """
+    """Return the steps of one period, at the stationary mean of the state."""
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     if steps_covered(network) is not None:
         raise fail("steady state", "a network that varies with its slots only", "parts that are OverTime")

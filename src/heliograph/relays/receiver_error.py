@@ -60,11 +60,7 @@ class Limited(NamedTuple):
 
 
 def power_limit_of(steps: Steps, value: ArrayLike, d: int) -> PowerLimit:
-    """The limit on the moments after each step, from one on the power that all relays send at each step.
-
-    Raises:
-        ValueError: a limit of the wrong shape, or not above the power of the mean state.
-    """
+    """The limit on the moments after each step, from one on the power that all relays send at each step."""
     horizon = len(steps.live)
     limit = per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
@@ -100,9 +96,6 @@ def best_within(
     Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local`, over the gains of all steps at
     once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that happens
     to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
-
-    Raises:
-        ValueError: no such gains, which rounding alone can cause.
     """
     whole = float(_judge(problem, local)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))

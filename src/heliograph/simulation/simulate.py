@@ -129,21 +129,24 @@ def monte_carlo(
     if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
         raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
     single = precision == "float32"
-    part = None if smooth is None else smoothed_part(network, smooth, horizon)
+    smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and not network.meshes and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
-        made: Record | Any = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
-        if made is not None:
-            return made
+        native_result: Record | Any = natively(
+            network, u, base, any_reducer, first_run, runs, chunk, progress, smoothing
+        )
+        if native_result is not None:
+            return native_result
     # Otherwise XLA: the world, and what is collected of it.
-    filters = AllFilters(network, part and part.kinds)
+    filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
-    job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
+    job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
     recorded = _recorded(job, first_run, runs, chunk, progress)
     if single:
-        network, part = network.in_single_precision(), part and part._replace(claims=lowered(part.claims))
-    result: Record | Any = finished(job.reducer, recorded, network, part)
+        network = network.in_single_precision()
+        smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
+    result: Record | Any = finished(job.reducer, recorded, network, smoothing)
     return result
 
 

@@ -186,9 +186,6 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
     """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
 
     `variance` is the bound on var g of a hop.
-
-    Raises:
-        ValueError: a channel that is not a chain of scalar hops.
     """
     hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
     # The recursion over the hops.

@@ -18,7 +18,7 @@ from heliograph.learning.description import Description
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.enlarged import joint_sensor
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail
@@ -66,9 +66,8 @@ def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    if isinstance(channel, OverTime):
-        return over_time([arrived(item) for item in unstack(channel)])
-    return arrived(channel)
+    result: Channel = at_each_step(arrived, channel)
+    return result
 
 
 Form = Literal["linear", "conditional"]

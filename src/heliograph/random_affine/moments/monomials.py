@@ -48,11 +48,7 @@ def count(variables: int, degree: int) -> int:
 
 
 def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
-    """Raise if a moment matrix would need more than the stated memory.
-
-    Raises:
-        ValueError: naming the number of entries and what to do.
-    """
+    """Raise if a moment matrix would need more than the stated memory."""
     if rows * columns > MEMORY_LIMIT_ENTRIES:
         got = f"{rows * columns:,} entries; use a lower order, or fewer states, outputs or stacked sensors at once"
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)

@@ -39,9 +39,6 @@ def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
-
-    Raises:
-        ValueError: a vector that does not have one entry for each monomial, or moments of more than the stated memory.
     """
     return channel.moments(order).expect(_checked(channel, order, moments))
 

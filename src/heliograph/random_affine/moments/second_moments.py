@@ -28,9 +28,6 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
 
     Up to CORNERS corner laws the ends are attained, since every entry is linear in each uncertain law; above, the
     intervals of the parts are multiplied: sound but not attained.
-
-    Raises:
-        ValueError: more corners than can be listed, in a map that is not a series or a stack.
     """
     check_forgets("channel of a bound", channel)
     corners = _corner_count(channel)
