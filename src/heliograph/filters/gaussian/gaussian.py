@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -98,6 +98,8 @@ def corrected(
     `unknown`: what of the signal decides gain and covariance, where that is less than all.
     """
     unknown = signal if unknown is None else unknown
+    if unknown.matrix is not None:
+        unknown = unknown._replace(rounding=output_rounding(unknown.matrix, size))
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))

@@ -8,6 +8,7 @@ import numpy as np
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.scores import AbstractWeights, Corrected, Expected, score_update, weighted_update
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_transform
 from heliograph.filters.innovation import innovation_covariance, log_density
@@ -58,9 +59,12 @@ class RobustFilter(AbstractBeliefFilter):
             law = noise.law(sensed)
             after = score_update(before, z, *law)
             center, total = law.mean_and_variance()
-            return Belief(after.mean, after.covariance), _innovation(before, z, center, diagonal(total), after, True)
-        after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
-        return Belief(after.mean, after.covariance), _innovation(before, z, noise.center, noise.covariance, after)
+            innovation = _innovation(before, z, center, diagonal(total), after, True)
+        else:
+            after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
+            innovation = _innovation(before, z, noise.center, noise.covariance, after)
+        size = initial_size(self)
+        return Belief(after.mean, above_rounding(after.covariance, state.covariance, size)), innovation
 
     def expected(self, state: Belief, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""

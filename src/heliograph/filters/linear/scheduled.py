@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
+from heliograph.filters.gaussian.precise import above_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -176,10 +177,9 @@ class LinearSystemFilter(AbstractSizedFilter):
         used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
         # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
-        after = Belief(
-            mean + solved.T @ jnp.where(present, z - expected, 0.0),
-            covariance_after(spread, cross, used, solved, observed, noise),
-        )
+        left = covariance_after(spread, cross, used, solved, observed, noise)
+        left = above_rounding(left, spread, self.mean**2 + np.diag(self.covariance))
+        after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 
     @in_float64

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
@@ -240,7 +241,8 @@ class MixtureFilter(AbstractSizedFilter):
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
-        result = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
+        result = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
 
     @in_float64

@@ -101,12 +101,16 @@ class UncertainModalFilter(AbstractModalFilter):
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
-        items = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
-        added = _worst(items, *_middle(state.low, state.high))
+        random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
+        added = _worst(random + gains @ noise @ gains.swapaxes(1, 2), *_middle(state.low, state.high))
         output, common = without_common(gains @ measure, state.law)
         observed = joined(output)
         expected = common + observed @ (state.mean - known_part(state.law, state.centre))
-        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
+        rounded = self.rounding(gains, jnp.max(random, axis=0), k)
+        mean, covariance, innovation = linear_observation(
+            state.mean, state.covariance, observed, added, expected, rounded, z
+        )
+        covariance = self.above_rounding(covariance, state.covariance, state.law)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
