@@ -88,10 +88,10 @@ def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
 def test_docstrings_of_studies_and_tests_have_no_private_word():
     """But "beside" for a place: "figures, and what the page says beside the numbers"."""
     wrong = {
-        f"{path}: {getattr(node, 'name', 'module')}: {found[0]}"
+        f"{path}: {getattr(node, 'name', 'module')}: {used[0]}"
         for path in OTHERS
         for node in [ast.parse(path.read_text()), *definitions(path)]
-        if (found := [word for word in PRIVATE.findall(ast.get_docstring(node) or "") if word.lower() != "beside"])
+        if (used := [word for word in PRIVATE.findall(ast.get_docstring(node) or "") if word.lower() != "beside"])
     }
     assert not wrong, "\n".join(sorted(wrong))
 
