@@ -218,8 +218,10 @@ class Recorded(NamedTuple):
 def finished(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, part: Part | None) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded
+    # Without smoothing the result of the network alone.
     if part is None:
         return reducer.finish(reducer.summed(sums, common, count), collected, network)
+    # Pairs of filtered and smoothed estimates, and sums of the NIS over all runs.
     nis = jax.tree.map(
         lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
     )
