@@ -1,4 +1,4 @@
-"""Networks with free numbers: a function that returns one, built again with other numbers where some are free."""
+"""Networks with free numbers: a function that returns one, built again with others in the places of its marks."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""Serialisation of a timeline: arrays in NumPy's own format, under a head of JSON."""
+"""Serialisation of a timeline: arrays in NumPy's own format, under a head of JSON, with what it may go on with."""
 
 import json
 from collections.abc import Mapping, Sequence

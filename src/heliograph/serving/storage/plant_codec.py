@@ -1,4 +1,4 @@
-"""Serialisation of a plant: bytes that restore the same bits."""
+"""Serialisation of a plant, bytes that restore the same bits, and carrying it over to a network that has changed."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""Labelled arrays: the common parts of datasets of records and of statistics."""
+"""Labelled arrays and wide tables: the common parts of records and of statistics."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
