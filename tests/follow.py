@@ -63,10 +63,10 @@ def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:
         shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(item))
         groups.setdefault((jax.tree.structure(item), shapes), []).append(i)
     parts, order = [], np.concatenate([*groups.values()])
-    for chosen in groups.values():
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in chosen])
-        data, inputs = _padded(rows[chosen], np.zeros((*rows[chosen].shape[:2], 0)))
-        parts.append(_cut(_each(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
+    for members in groups.values():
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in members])
+        data, inputs = _padded(rows[members], np.zeros((*rows[members].shape[:2], 0)))
+        parts.append(_cut(_followed(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[np.argsort(order)], *parts)
 
 
@@ -109,11 +109,11 @@ def _scan(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
 _scan_by_xla = compiled(_scan)
 
 
-def _each(items: AbstractFilter, z: Any, u: Any) -> Followed:
+def _followed(items: AbstractFilter, z: Any, u: Any) -> Followed:
     """`_scan` of stacked filters: by native code, or by XLA where that does not support them."""
     with jax.enable_x64(True):
         choice = chosen(_every_row, (items, z, u), [True] * 3)
-        return choice.results() if choice.code is not None else _each_by_xla(items, z, u)
+        return choice.results() if choice.code is not None else _followed_by_xla(items, z, u)
 
 
 def _every_row(item: AbstractFilter, z: Any, u: Any) -> Followed:
@@ -121,5 +121,5 @@ def _every_row(item: AbstractFilter, z: Any, u: Any) -> Followed:
 
 
 @compiled
-def _each_by_xla(items: AbstractFilter, z: Any, u: Any) -> Followed:
+def _followed_by_xla(items: AbstractFilter, z: Any, u: Any) -> Followed:
     return jax.vmap(_every_row)(items, z, u)
