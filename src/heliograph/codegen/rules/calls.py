@@ -50,9 +50,11 @@ def _over(
         results = zip(_single(lowering, equation, inputs), shapes, strict=True)
         return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
     count, rest = runs[-1], runs[:-1]
+    # A few are written out.
     if count <= FEW:
         items = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
         return [_together(lowering, list(results)) for results in zip(*items, strict=True)]
+    # Of many, a loop takes apart what differs between them; what they share stays whole.
     differs = [x.shape[-1] > 1 for x in inputs]
     rows = [in_memory(lowering, x) if d else _run(x, 0) for x, d in zip(inputs, differs, strict=True)]
 
