@@ -12,9 +12,8 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import INPUT, in_words, why_inputs
-from heliograph.live.identity import Identity, check_same, short_name, versions
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
-from heliograph.live.snapshot import packed, unpacked
+from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
