@@ -35,7 +35,7 @@ from .model.sensor import (
     LinearSensor as LinearSensor,
     Sensor as Sensor,
 )
-from .model.state_space import (
+from .model.sensor import (
     state_space as state_space,
 )
 from .model.channel import (
@@ -65,7 +65,7 @@ from .filters.gaussian.gaussian import (
     extended_filter as extended_filter,
     mean_gain_filter as mean_gain_filter,
 )
-from .filters.gaussian.kalman import (
+from .filters.gaussian.gaussian import (
     kalman_filter as kalman_filter,
 )
 from .filters.gaussian.unscented import (

@@ -108,12 +108,12 @@ class Study(Generic[Setting, Outcome]):
             stages.advance = advance
             return self.compute(chosen, stages)
 
-        def tell(outcome: Outcome) -> Results:
+        def results_of(outcome: Outcome) -> Results:
             stages.stage = "drawing and writing"
             return self._results(chosen, outcome, lines)
 
         with stages.failing_in_a_line():
-            outcome = write_results(target, self.stages, work, tell, self.needs)
+            outcome = write_results(target, self.stages, work, results_of, self.needs)
         stages.clear()
         print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome
@@ -178,8 +178,11 @@ class Study(Generic[Setting, Outcome]):
         read, chosen = b"".join(content(path) for path in self.files(setting)), digest(setting)
         if chosen is None:
             return None
-        folder = Path(inspect.getfile(self.compute)).parent
-        source = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
+        # Of the whole package: a study may compute with what another one defines.
+        root = import_module(self.compute.__module__.partition(".")[0])
+        file = Path(inspect.getfile(root))
+        paths = sorted(file.parent.rglob("*.py")) if hasattr(root, "__path__") else [file]
+        source = b"".join(path.read_bytes() for path in paths)
         return f"{chosen} {hashlib.sha256(read + source).hexdigest()} {heliograph.__version__}"
 
 

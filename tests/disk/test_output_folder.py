@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from heliograph.disk.output_file import check_replaceable, clear_left, whole_folder
+from heliograph.disk.whole_file import check_replaceable, clear_left, whole_folder
 
 
 def test_new_folder_appears_at_the_end(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_full_disk_names_the_folder(tmp_path: Path) -> None:
     assert caught.value.filename == str(tmp_path / "out")
 
 
-def test_only_own_results_are_replaceable(tmp_path: Path) -> None:
+def test_only_earlier_results_are_replaceable(tmp_path: Path) -> None:
     check_replaceable(tmp_path / "new", "mark")
     check_replaceable(tmp_path, "mark")
     (tmp_path / "other").touch()

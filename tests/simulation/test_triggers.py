@@ -44,7 +44,7 @@ def test_a_heartbeat_bounds_the_time_between_transmissions():
     assert np.any(np.abs(sent) == REASON.HEARTBEAT)
 
 
-def test_a_schedule_is_kept():
+def test_a_schedule_is_followed():
     sent = record_of(hg.Periodic(5, 2)).transmissions["a"][..., 0]
     assert np.array_equal(np.flatnonzero(sent[0]), np.arange(2, 120, 5)) and set(np.abs(sent[0])) == {
         0,

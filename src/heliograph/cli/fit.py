@@ -90,16 +90,16 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
-    result = learn_from(build, early, starts=starts, seed=seed, progress=say)
-    assert isinstance(result, Fit)  # since no sender decides
+    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    assert isinstance(fitted, Fit)  # since no sender decides
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
-    judged = changes(start, result.network, recording.measurements, recording.inputs, cut) if cut < rows else []
-    uniform = uniformity(result.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
+    judged = changes(start, fitted.network, recording.measurements, recording.inputs, cut) if cut < rows else []
+    uniform = uniformity(fitted.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
     advance("looking at losses")
     fates = fates_of_measurements(recording.measurements)
     losses = learn_losses_of({name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])})
-    return Learned(network, str(measurements), result, cut, rows - cut, judged, uniform, losses)
+    return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
 
 
 def results(learned: "Learned", out: Path, network: str) -> "Results":

@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 if TYPE_CHECKING:
@@ -89,11 +89,7 @@ _by_xla = quickly_compiled(_results)
 def data_of(
     item: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
-    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed.
-
-    Raises:
-        ValueError: another shape than the filter's, infinite values, missing inputs, more steps than the filter covers.
-    """
+    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed."""
     z = rows("measurements", measurements, None, item.received or None, missing=True)
     z = z if item.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not item.inputs else inputs

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import Plan
-from heliograph.numerics.linalg import cholesky, symmetrize
-from heliograph.numerics.small_matrix import rounding
+from heliograph.numerics.linalg import cholesky, rounding, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
 

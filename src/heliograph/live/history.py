@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.static import Static
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.judging import plausible_step, step_without

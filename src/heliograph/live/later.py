@@ -16,7 +16,7 @@ from heliograph.live.history import History, NetworkStep, at_step, interval
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import Fused

@@ -10,8 +10,7 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
@@ -169,11 +168,7 @@ class Steps(Module):
 
 
 def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link.
-
-    Raises:
-        ValueError: probabilities that are uncertain.
-    """
+    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link."""
     try:
         known = link.corner_count() == 1
     except ValueError:  # too many corners to list

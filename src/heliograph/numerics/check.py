@@ -1,19 +1,64 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.domain import PROBABILITY, REAL, SIMPLEX, Domain, tell, tell_covariance
 from heliograph.numerics.traced import is_traced
-from heliograph.numerics.types import ArrayLike, Names
-from heliograph.numerics.unit import NameWithUnit
+from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
+
+
+class Domain(NamedTuple):
+    """Numbers between two limits, positive ones that sum to one along the last axis, or a covariance matrix."""
+
+    kind: Literal["interval", "simplex", "covariance"] = "interval"
+    low: float = -np.inf
+    high: float = np.inf
+
+
+REAL, POSITIVE, PROBABILITY = Domain(), Domain(low=0.0), Domain(low=0.0, high=1.0)
+SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
+
+
+class Marked(np.ndarray):
+    """Array that reports the domain that a check requires of it; arrays computed from it report nothing."""
+
+    report: Callable[[str, Domain], None] | None = None
+
+
+def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
+    """Return a copy of an array that calls `report(name, domain)` when it is checked."""
+    result = np.array(value, dtype=np.float64).view(Marked)
+    result.report = report
+    return result
+
+
+def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
+    """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
+    if isinstance(value, Marked):
+        if value.report is not None:
+            value.report(name, whole)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            if isinstance(item, Marked | list | tuple):
+                report_domain(name, item, whole if entry is None else entry, entry)
+
+
+def report_covariance(name: str, value: object) -> None:
+    """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
+    if isinstance(value, Marked):
+        report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
+    elif isinstance(value, list | tuple):
+        for i, row in enumerate(value):
+            for j, item in enumerate(row if isinstance(row, list | tuple) else []):
+                report_domain(name, item, POSITIVE if i == j else REAL)
+
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units
@@ -57,7 +102,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
     shape alone is checked.
     """
-    tell(name, value, REAL)
+    report_domain(name, value, REAL)
     result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
         not isinstance(projection, int) or projection == have
@@ -101,7 +146,7 @@ def _numbers(name: str, value: ArrayLike) -> Any:
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
     """Return `value` as a finite scalar between `low` and `high`."""
-    tell(name, value, Domain(low=low, high=high))
+    report_domain(name, value, Domain(low=low, high=high))
     result = array(name, value, ())
     if not is_traced(result) and not low <= result <= high:
         raise fail(name, _range_words(low, high), f"{float(result):g}")
@@ -238,12 +283,8 @@ def backwards_text(clock: np.ndarray, row: int) -> str:
 
 
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
-    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity.
-
-    Raises:
-        ValueError: wrong shape, not finite, not symmetric, or with a negative eigenvalue.
-    """
-    tell_covariance(name, value)
+    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
+    report_covariance(name, value)
     result = _numbers(name, value)
     # A scalar c stands for c I.
     if dimension is not None and result.ndim == 0:
@@ -277,7 +318,7 @@ def own_units(matrix: np.ndarray) -> np.ndarray:
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
     """Return non-negative numbers that sum to one."""
-    tell(name, value, SIMPLEX, PROBABILITY)
+    report_domain(name, value, SIMPLEX, PROBABILITY)
     result = array(name, value, (count,))
     if is_traced(result):
         return result

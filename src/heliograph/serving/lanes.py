@@ -16,7 +16,7 @@ from heliograph.live.player import player
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.judging import implausible
 from heliograph.simulation.network import FUSED, Network

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, advance, anonymous, apply, begin, distinct, memories
 from heliograph.random_affine.delay import sent
 from heliograph.simulation.draws import (

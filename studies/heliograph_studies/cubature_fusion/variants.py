@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
-from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
@@ -116,7 +116,7 @@ class MixedCross(AbstractFilter):
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        size = initial_size(self.base.initial_mean, self.base.initial_covariance)
+        size = initial_size(self.base)
         after, innovation = corrected(prior, signal, channel, self.base.rule, jnp.asarray(z), size)
         return Propagated(*after, state.points), innovation
 

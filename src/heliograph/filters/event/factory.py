@@ -56,7 +56,7 @@ def event_filter(
     known, lost = check_count("known", known), check_count("lost", lost, 0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     described, initial = _described(channel)
-    steps = unstack(described) if isinstance(described, OverTime) else [described]
+    steps = unstack(described)
     outputs = len(first(sensor).outputs)
     loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
@@ -109,7 +109,7 @@ def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray
     drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
-    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(item) for item in unstack(channel)]
     parts = by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
 

@@ -11,11 +11,10 @@ import numpy as np
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, join, log_total, reduced, safe_log, together
-from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -308,14 +307,9 @@ class EventFilter(AbstractSizedFilter):
         """Mean and covariance of the whole sum."""
         return Estimate(*self._whole(state), self.claim)
 
-    def smoother_step(
-        self, before: EventBelief, prior: EventBelief, after: EventBelief, innovation: Innovation, z: ArrayLike,
-        u: ArrayLike, k: Step,
-    ) -> AbstractSmootherStep:  # fmt: skip
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """The moments of the joined sums around the update."""
-        local, last, now = (self._whole(state) for state in (before, prior, after))
-        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
-        return moments_smoother_step(now, last, cross, "nominal")
+        return moments_around(self, step, self._whole)
 
     def _whole(self, state: EventBelief) -> Belief:
         """Mean and covariance of the state by the whole sum."""

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
-from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.mode_observations import receive
-from heliograph.filters.modes.multiple_model import link_by_mode, merged, together
+from heliograph.filters.modes.multiple_model import link_by_mode, merged, receive, together
 from heliograph.filters.modes.side_information import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -84,8 +83,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        size = initial_size(at(self.plant, 0))
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
 
         after, weight, mixed = receive(

@@ -17,9 +17,8 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import check_count, fail, function, instance
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
@@ -115,15 +114,15 @@ def relay_tree(
         # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
-        parts = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
-        covariances, weights, level = (list(leaves) for leaves in zip(*parts, strict=True))
-        known, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
+        block_results = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
+        covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
+        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
         # Level by level up to the root.
         while True:
-            known.append(np.asarray(_spread(shared)))
-            if len(known[-1]) == 1:
-                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(known), tuple(used))
-            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(known[-1]), degree)]
+            level_covariances.append(np.asarray(_spread(shared)))
+            if len(level_covariances[-1]) == 1:
+                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
+            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
             outputs = [to_numpy(_relay(group)) for group in groups]
             used.append(np.stack([_padded(item, degree) for item, _ in outputs]))
             shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in outputs))

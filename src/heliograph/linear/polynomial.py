@@ -1,0 +1,230 @@
+"""Polynomial filters before any data: the system behind the filter with memory, and gains over the linear filter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from heliograph.linear.lift import (
+    affine,
+    check_model,
+    initial_moments,
+    lifted_system,
+    linear_rows,
+    mean_and_spread,
+    model_routes,
+    refuse_lift,
+)
+from heliograph.linear.recursion import lmmse
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack, known
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.monomials import exponents, symmetric_power
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+
+
+def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule) -> LinearSystem:
+    """Return the square of (x, q, z), with q the estimate of a linear filter: q+ = F q + K z+ + c.
+
+    Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
+    `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
+    """
+    check_model(plant, sensor, channel)
+    start, horizon = first(plant), linear.horizon
+    n, m = len(start.states), int(first(channel).outputs)
+    if linear.gains.gain.shape[1:] != (n, m):
+        raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
+    total = 2 * n + m
+    refuse_lift(2, total, m + n, horizon)
+    # (x_0, q_0, 0) is an affine function of x_0.
+    beginning = _homogeneous(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
+    moments = push_known(beginning, 4, initial_moments(start, 4))
+    before = second_moments(moments, total + 1, 2)
+    mean, spread = mean_and_spread(before)
+    received, parts, rounding, stored = _received_products(n, m), [], [], _Recorded()
+    for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
+        move, listen = stored.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
+        wide = stored.widen(route.measurement, n)
+        # E[(x, q, z)+^2 | (x, q, z)^2] = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
+        transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
+        moments = push_known(listen, 4, wide[1] @ push(move, 4, moments))
+        after = second_moments(moments, total + 1, 2)
+        # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
+        process = after - transition @ before @ transition.T
+        nothing = np.zeros(len(received)), np.zeros((len(received), len(received)))
+        parts.append((*affine(transition), process[:-1, :-1], received, *nothing))
+        rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
+        before = after
+    steps = Steps(*map(np.array, zip(*parts, strict=True)))
+    return LinearSystem(steps, mean, spread, linear_rows(total, 2, n), rounding)
+
+
+def _homogeneous(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
+    return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
+
+
+def _listen(g: Gains) -> np.ndarray:
+    """(x+, q, z+) -> (x+, F q + K z+ + c, z+), homogeneous."""
+    n, m = g.gain.shape
+    after = np.eye(2 * n + m)
+    after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
+    return _homogeneous(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
+
+
+class _Recorded:
+    """Cache of the noise's moments and those of the route to z, recomputed only where the model changes."""
+
+    def __init__(self) -> None:
+        self.noise: AbstractNoise | None = None
+        self.joint: AbstractNoise | None = None
+        self.route: AbstractRandomAffine | None = None
+        self.wide: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def move(self, plant: GainAndNoise, m: int) -> GainAndNoise:
+        """(x, q, z) -> (x+, q)."""
+        n = plant.inputs
+        if self.joint is None or plant.noise is not self.noise:
+            still = Gaussian(np.zeros((n, n)))
+            self.noise, self.joint = plant.noise, Tabulated(Independent([plant.noise, still]), 4)
+        matrix = np.zeros((2 * n, 2 * n + m))
+        matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
+        return GainAndNoise(Constant(1.0), matrix, self.joint)
+
+    def widen(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Moments of order 2 and 4 of (x+, q) -> (x+, q, z+)."""
+        if route is not self.route:
+            wide = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
+            self.route, self.wide = route, (np.asarray(wide.moments(2).matrix), np.asarray(wide.moments(4).matrix))
+        return self.wide
+
+
+def _received_products(n: int, m: int) -> np.ndarray:
+    """Rows that read (monomials of z up to degree 2, z_i q_j) off the square of (x, q, z)."""
+    total = 2 * n + m
+    places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}
+    expected = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
+    for i in range(m):
+        for j in range(n):
+            expected.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
+    rows = np.zeros((len(expected), len(places) - 1))
+    for row, powers in zip(rows, expected, strict=True):
+        row[places[powers]] = 1.0
+    return rows
+
+
+SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
+
+
+@readable
+@dataclass(frozen=True)
+class GainOverLinear:
+    """Error covariances of filters by degree, exact before any data, and the skewness that higher degrees exploit.
+
+    Args:
+        states: names of the states.
+        covariance: error covariance over time (time, n, n) by degree.
+        skewness: the largest standardised joint third central moment of (x_k, z_k) over all steps.
+        after: first step that counts in `gain`, which leaves out the start.
+    """
+
+    states: tuple[str, ...]
+    covariance: dict[int, Float[np.ndarray, "time n n"]]
+    skewness: float
+    after: int
+
+    def gain(self, degree: int) -> Float[np.ndarray, "n"]:
+        """Return the share of the linear filter's error variance that this degree removes, for each state."""
+        mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
+        return np.asarray(1 - mean[degree] / mean[1])
+
+    @property
+    def symmetric(self) -> bool:
+        """True if all third moments vanish; then the quadratic filter is the linear one (a cubic one may still gain).
+
+        Third moments of (x_k, z_k) at one time are enough: x_j given x_i is affine in x_i plus independent noise, so
+        the third moments across times are made of them, and centred squares are uncorrelated with all x_k and z_k.
+        """
+        return self.skewness <= SYMMETRIC
+
+
+def gain_over_linear(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    horizon: int = 100,
+    degrees: Sequence[int] = (2, 3),
+    after: int | None = None,
+) -> GainOverLinear:
+    """Compute how much filters of these degrees gain over the best linear one, from the model alone.
+
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel.
+        horizon: number of steps, 100 unless given.
+        degrees: degrees to compare with 1, each at least 2; (2, 3) unless given.
+        after: first step that counts, a third of the horizon unless given.
+
+    Raises:
+        ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
+    """
+    check_count("horizon", horizon)
+    expected = sorted({1, 2, *degrees})
+    if not degrees or min(degrees) < 2:
+        raise fail("degrees", "at least one, all of 2 or more", list(degrees))
+    begin = horizon // 3 if after is None else after
+    if not 0 <= begin < horizon:
+        raise fail("first step that counts", f"one from 0 to {horizon - 1}", begin)
+    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in expected}
+    n, m = len(first(plant).states), int(first(channel).outputs)
+    covariances = {d: lmmse(system).gains.covariance for d, system in systems.items()}
+    return GainOverLinear(first(plant).states, covariances, skewness(systems[2], n, m), begin)
+
+
+def skewness(square: LinearSystem, states: int, outputs: int) -> float:
+    """Largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over a, b, c among x_k, z_k, from the system of degree 2.
+
+    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), with a b a monomial of the square.
+    """
+    x, z = _places(states), _places(outputs)
+    before = state_moments(square)
+    worst = 0.0
+    for k in range(square.horizon):
+        s, spread = square.step(k), before.covariance[k + 1]
+        cross = s.output @ spread
+        # Joint covariance and mean of the lifted (x, z).
+        joint = np.block([[spread, cross.T], [cross, cross @ s.output.T + s.noise]])
+        mean = np.concatenate([before.mean[k + 1], s.output @ before.mean[k + 1] + s.offset])
+        linear = [x[(i,)] for i in range(states)] + [len(spread) + z[(i,)] for i in range(outputs)]
+        deviation = np.sqrt(np.diag(joint))
+        for places, start in ((x, 0), (z, len(spread))):
+            for (a, b), place in ((key, p) for key, p in places.items() if len(key) == 2):
+                i, j = start + places[(a,)], start + places[(b,)]
+                # k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c).
+                third = joint[start + place, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
+                size = deviation[i] * deviation[j] * deviation[linear]
+                ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
+                worst = max(worst, float(np.max(ratio)))
+    return worst
+
+
+def _places(variables: int) -> dict[tuple[int, ...], int]:
+    """Places of y_i and of y_i y_j among the monomials of degree 2."""
+    index = {powers: i for i, powers in enumerate(exponents(variables + 1, 2))}
+    unit = np.eye(variables + 1, dtype=int)
+    places: dict[tuple[int, ...], int] = {
+        (i,): index[tuple(int(v) for v in unit[i] + unit[-1])] for i in range(variables)
+    }
+    for i, j in combinations_with_replacement(range(variables), 2):
+        places[(i, j)] = index[tuple(int(v) for v in unit[i] + unit[j])]
+    return places
