@@ -18,7 +18,7 @@ from heliograph.simulation.judging import any_implausible, doubts, forbidden_row
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part, with_truth
+from heliograph.simulation.smoothed import Smoother, found_record, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters, begun
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -196,7 +196,7 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[st
     """Smoothed results where that was asked for, and what the filters judged."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else one_run(later.both, results)) | judged
+    return (results if later is None else later.both(results)) | judged
 
 
 _by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scanned)
