@@ -33,8 +33,8 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: one name for memories that differ.
     """
-    each = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
-    distinct(memory for item in each.values() for memory in item.values())
+    held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
+    distinct(memory for item in held.values() for memory in item.values())
     return {
         name: np.array(
             [
@@ -43,7 +43,7 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
             ],
             dtype=np.uint32,
         )
-        for name, item in ((name, each[id(channel)]) for name, channel in channels.items())
+        for name, item in ((name, held[id(channel)]) for name, channel in channels.items())
     }
 
 
@@ -71,9 +71,9 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     results = []
     for same in alike.values():
         places = np.array([e for e, channel in enumerate(items) if id(channel) in same])
-        each = np.array([same[id(items[e])] for e in places])
-        one = stack([kinds[which] for which in same])
-        channel = jax.tree.map(lambda leaf, each=each: leaf[each] if eqx.is_array(leaf) else leaf, one)
+        rows = np.array([same[id(items[e])] for e in places])
+        kind = stack([kinds[which] for which in same])
+        channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, kind)
         results.append(ChannelGroup(channel, checksums[places], np.stack([memories[e] for e in places]), places))
     return tuple(results)
 

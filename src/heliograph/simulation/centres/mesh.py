@@ -155,8 +155,8 @@ class Mesh(Module):
             return now
         off, information = now - state.sent, jax.vmap(inverse)(state.covariance)
         far = jnp.einsum("ida,idab,idb->id", off, information[self.senders], off) > self.alpha * off.shape[-1]
-        asked = (far & self.edges.present).astype(int)[:, 1:]  # by others
-        moved = jnp.zeros(len(mean), dtype=int).at[self.senders[:, 1:]].max(asked)
+        moving = (far & self.edges.present).astype(int)[:, 1:]  # for others
+        moved = jnp.zeros(len(mean), dtype=int).at[self.senders[:, 1:]].max(moving)
         return jnp.where((arrives & (moved[self.senders] > 0))[..., None], now, state.sent)
 
     def parts(
@@ -287,9 +287,9 @@ class Mesh(Module):
 
     def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
         """Weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
-        found = [part.rule.weights_ahead(arrived[:, part.rows, -1, : part.width])
+        weights = [part.rule.weights_ahead(arrived[:, part.rows, -1, : part.width])
                  for part in self.buckets if isinstance(part.rule, FrozenWeights)]  # fmt: skip
-        return () if None in found else tuple(filter(None, found))
+        return () if None in weights else tuple(filter(None, weights))
 
     def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
         """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
