@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.filters.plausibility import why_inputs, why_values
 from heliograph.live.event import INPUTS
 from heliograph.live.history import History, NetworkStep, replay
-from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
+from heliograph.live.snapshot import Identity, network_identity
 from heliograph.live.static import cast
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant

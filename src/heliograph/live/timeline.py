@@ -1,7 +1,7 @@
 """Filters on events in any order: each event gets a verdict and its place in time."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, VERDICTS, Known, Verdict, moment, numbers, whole
-from heliograph.live.finals import Finals
 from heliograph.live.history import READ, History, copied, read
-from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import SenderStatus, sender_status
-from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
+from heliograph.live.snapshot import check_same, packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
@@ -26,6 +24,26 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
+
+
+class Finals:
+    """Final outputs, one entry a row, in order of time; beyond `most` rows the oldest parts are dropped."""
+
+    def __init__(self, most: int):
+        self.most, self._parts = most, list[tuple[np.ndarray, list[np.ndarray]]]()
+
+    def add(self, time: np.ndarray, outputs: list[np.ndarray]) -> None:
+        """Append the outputs of some rows."""
+        self._parts.append((time, outputs))
+        while sum(len(part) for part, _ in self._parts[1:]) >= self.most:
+            del self._parts[0]
+
+    def take(self, like: Sequence[jax.Array]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Remove and return all times and leaves (time, ...), of the shapes that the history has."""
+        parts = [(np.zeros(0), [np.zeros((0, *leaf.shape[1:])) for leaf in like]), *self._parts]
+        self._parts = []
+        times, outputs = zip(*parts, strict=True)
+        return np.concatenate(times), [np.concatenate(leaves) for leaves in zip(*outputs, strict=True)]
 
 
 @readable
