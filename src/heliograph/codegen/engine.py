@@ -34,6 +34,11 @@ class Choice(NamedTuple):
     why: str
     arrays: tuple[Any, ...] = ()
 
+    @property
+    def explained(self) -> str:
+        """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
+        return f"xla: {self.why}" if self.code is None else f"native: {self.code.code.operations} operations"
+
     def results(self) -> PyTree:
         """Run the code on the arrays."""
         assert self.code is not None
@@ -55,8 +60,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", shown(function))
-    choice = chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments))
-    return f"xla: {choice.why}" if choice.code is None else f"native: {choice.code.code.operations} operations"
+    return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
 
 
 def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
