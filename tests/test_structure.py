@@ -24,7 +24,7 @@ ORDER = [
         "filters.plausibility",
         "filters.rows",
         "filters.smoother_step.base",
-        "filters.smoother_step.linear",
+        "filters.smoother_step.base",
         "filters.smoother_step.moments",
         "filters.smoother_step.building",
         "filters.gaussian.transform",

@@ -163,7 +163,7 @@ def test_statistics_of_a_state_known_exactly_are_numbers():
 
 
 def test_a_known_state_that_is_not_where_it_is_said_to_be_is_infinitely_far():
-    from heliograph.numerics.small_matrix import squared_distance
+    from heliograph.numerics.linalg import squared_distance
 
     distance = jax.jit(squared_distance)
     with jax.enable_x64(True):

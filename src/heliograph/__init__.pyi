@@ -65,7 +65,7 @@ from .filters.gaussian.gaussian import (
     extended_filter as extended_filter,
     mean_gain_filter as mean_gain_filter,
 )
-from .filters.gaussian.kalman import (
+from .filters.gaussian.gaussian import (
     kalman_filter as kalman_filter,
 )
 from .filters.gaussian.unscented import (

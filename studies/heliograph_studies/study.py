@@ -178,8 +178,11 @@ class Study(Generic[Setting, Outcome]):
         read, chosen = b"".join(content(path) for path in self.files(setting)), digest(setting)
         if chosen is None:
             return None
-        folder = Path(inspect.getfile(self.compute)).parent
-        source = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
+        # Of the whole package: a study may compute with what another one defines.
+        root = import_module(self.compute.__module__.partition(".")[0])
+        file = Path(inspect.getfile(root))
+        paths = sorted(file.parent.rglob("*.py")) if hasattr(root, "__path__") else [file]
+        source = b"".join(path.read_bytes() for path in paths)
         return f"{chosen} {hashlib.sha256(read + source).hexdigest()} {heliograph.__version__}"
 
 

@@ -18,13 +18,13 @@ from heliograph.campaign.engines import in_processes
 from heliograph.campaign.plan import versions
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.disk.holding import LOCK, held, only_here
+from heliograph.disk.whole_file import LOCK, held, only_here
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from heliograph.disk.holding import only_here
+from heliograph.disk.whole_file import only_here
 with only_here(Path(sys.argv[1])) as alone:
     print(alone, flush=True)
     time.sleep(60)

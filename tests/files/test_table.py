@@ -7,8 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from heliograph.disk.output_file import check_output, check_output_folder
-from heliograph.disk.whole_file import naming
+from heliograph.disk.whole_file import check_output, check_output_folder, naming
 from heliograph.files.table import read_table, write_table
 
 COLUMNS = {

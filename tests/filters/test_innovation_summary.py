@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.innovation_summary import outlying, summarise_innovations
+from heliograph.filters.innovation import outlying, summarise_innovations
 from heliograph.model.estimate import Innovation
 
 

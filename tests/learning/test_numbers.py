@@ -8,7 +8,7 @@ from heliograph.learning.intervals import bartlett, block_sums, cosines, white
 from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
-from heliograph.numerics.domain import POSITIVE, REAL
+from heliograph.numerics.check import POSITIVE, REAL
 
 RNG = np.random.default_rng(0)
 

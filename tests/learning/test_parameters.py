@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.learning.likelihood.transforms import from_line, link, slope, to_line, unlink
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
+from heliograph.numerics.check import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
 
 
 def network(channel, plant_noise=0.1, sensor_noise=0.1):

@@ -3,7 +3,7 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.linear.memory import memory_system
+from heliograph.linear.polynomial import memory_system
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, scalar_system, two_sensors
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.unseen import eigenspaces, fastest_unseen, reached
+from heliograph.linear.known_losses import eigenspaces, fastest_unseen, reached
 
 NONE = np.zeros((0, 2))
 INDEPENDENT = np.array([[0.3, 0.7]] * 2)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.schedule import load_schedule
+from heliograph.linear.system import load_schedule
 from heliograph.model.channel import hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant, Plant

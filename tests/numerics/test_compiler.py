@@ -3,8 +3,8 @@
 import jax
 import pytest
 
-from heliograph.numerics import compiler
-from heliograph.numerics.compiler import LEVEL, fully_optimised, quickly_compiled, understood
+from heliograph.numerics import float64 as compiler
+from heliograph.numerics.float64 import LEVEL, fully_optimised, quickly_compiled, understood
 
 
 @pytest.mark.parametrize("least", [False, True])

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.numerics.linalg import cholesky, psd_solve
-from heliograph.numerics.small_matrix import UNROLL_LIMIT
+from heliograph.numerics.linalg import UNROLL_LIMIT, cholesky, psd_solve
 
 FACTOR = jax.jit(cholesky)
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.linalg import times
 from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
-from heliograph.numerics.small_matrix import times
 
 RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(3, 4, 2, 2)), RNG.normal(size=(2, 2))

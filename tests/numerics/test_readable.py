@@ -13,8 +13,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import fusion, model, random_affine, simulation
-from heliograph.numerics.readable import readable
-from heliograph.numerics.same import same
+from heliograph.numerics.module import readable, same
 
 WIDE, LONG = 110, 10
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.numerics import linalg, small_matrix
+from heliograph.numerics import linalg
+from heliograph.numerics.linalg import UNROLL_LIMIT
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import UNROLL_LIMIT
 
 RUNS, NODES = 5, 3
 ROUNDING = 1e-12  # of a few hundred operations on well conditioned matrices
@@ -33,7 +33,7 @@ def test_nested_maps_give_what_the_library_gives(n):
 
 @pytest.mark.parametrize("inner", [3, 2 * UNROLL_LIMIT + 1])
 def test_a_product_broadcasts_what_is_not_mapped(inner):
-    times = runs_last(small_matrix.times)
+    times = runs_last(linalg.times)
     rng = np.random.default_rng(3)
     a, b = rng.normal(size=(2, inner)), rng.normal(size=(RUNS, NODES, inner, 4))
     result = nested(lambda b: times(a, b), b)
@@ -74,7 +74,7 @@ def test_further_axes_are_carried_along():
     last = np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1)
     with jax.enable_x64(True):
         a_last, b_last = map(jnp.asarray, last)
-        np.testing.assert_allclose(small_matrix.inner(a_last, b_last), np.einsum("rij,rij->r", a, b), rtol=ROUNDING)
-        np.testing.assert_allclose(small_matrix.trace(a_last), np.trace(a, axis1=1, axis2=2), rtol=ROUNDING)
-        result = np.moveaxis(np.asarray(small_matrix.congruence(a_last, b_last)), -1, 0)
+        np.testing.assert_allclose(linalg.inner(a_last, b_last), np.einsum("rij,rij->r", a, b), rtol=ROUNDING)
+        np.testing.assert_allclose(linalg.trace(a_last), np.trace(a, axis1=1, axis2=2), rtol=ROUNDING)
+        result = np.moveaxis(np.asarray(linalg.congruence(a_last, b_last)), -1, 0)
     np.testing.assert_allclose(result, a @ b @ np.swapaxes(a, 1, 2), atol=ROUNDING * np.abs(result).max())

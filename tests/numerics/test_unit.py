@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import estimate_columns, read_recording
-from heliograph.numerics.unit import NameWithUnit, unit_of, units_in, with_unit
+from heliograph.numerics.types import NameWithUnit, unit_of, units_in, with_unit
 
 
 def plant(states: object) -> hg.LinearPlant:

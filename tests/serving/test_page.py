@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 pytest.importorskip("uvicorn")
-from heliograph.numerics.unit import NameWithUnit
+from heliograph.numerics.types import NameWithUnit
 from heliograph.serving.page import Door, door, shown
 from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch, watch_of
 from tests.serving.watched import Scripted

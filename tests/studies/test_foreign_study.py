@@ -1,6 +1,7 @@
 """A study of another package by the command line: other numbers, bad ones, failure half-way and resumption."""
 
 import json
+import sys
 
 import pytest
 
@@ -66,6 +67,7 @@ def package(tmp_path, monkeypatch):
     (folder / "page.md").write_text(PAGE)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-walk\nVersion: 1\n")
     (info / "entry_points.txt").write_text("[heliograph.studies]\nwalk = my_walk:example\n")
+    monkeypatch.delitem(sys.modules, "my_walk", raising=False)  # another test's, of another folder
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -99,3 +101,13 @@ def test_it_fails_half_way_and_goes_on_from_there(package, capsys):
     assert cli.main(["example", "walk", "--out", "out"]) == 0
     assert capsys.readouterr().out.splitlines()[0] == "2.0 squared is 4.0"
     assert (package / "log").read_text() == "w"  # what was done is not done again
+
+
+def test_stages_are_done_again_if_another_module_of_the_package_changed(package):
+    (package / "stop").touch()
+    assert cli.main(["example", "walk", "--out", "out"]) == 2
+    other = package / "my_walk" / "other_study"
+    other.mkdir()
+    (other / "compute.py").write_text("STEP = 2")
+    assert cli.main(["example", "walk", "--out", "out"]) == 2
+    assert (package / "log").read_text() == "ww"

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from heliograph.files.network_file import load_function
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 

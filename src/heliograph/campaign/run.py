@@ -25,10 +25,9 @@ from heliograph.campaign.store import (
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
-from heliograph.disk.holding import only_here
-from heliograph.disk.output_file import check_output_folder, check_replaceable, clear_left
+from heliograph.disk.whole_file import check_output_folder, check_replaceable, clear_left, only_here
 from heliograph.numerics.check import check_count, fail, file_path, instance
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]

@@ -20,8 +20,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from heliograph.campaign.plan import Campaign, Chunk
 from heliograph.campaign.read import read_campaign
-from heliograph.disk.output_file import whole_folder
-from heliograph.disk.whole_file import sync
+from heliograph.disk.whole_file import sync, whole_folder
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
 

@@ -24,7 +24,7 @@ from heliograph.campaign.store import (
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import alike
 from heliograph.numerics.check import fail
-from heliograph.numerics.small_matrix import squared_distance
+from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import by_name, measurements_of

@@ -29,7 +29,7 @@ def place(text: str = "") -> Parameter:
 
 def folder(command: str, out: Path | None, name: str) -> Path:
     """Return the folder in which the results' folder `name` is made, checked to be writable: `--out` or its parent."""
-    from heliograph.disk.output_file import check_output_folder
+    from heliograph.disk.whole_file import check_output_folder
     from heliograph.numerics.check import fail
 
     if out is None:

@@ -11,9 +11,8 @@ TEMPLATE = "my_network.py.txt"  # no module of ours
 
 def new(file: Annotated[Path, place("Python file to write; it must not be there yet.")], /) -> None:
     """Write a commented network to begin with: a file that runs, and simulates data for itself."""
-    from heliograph.disk.output_file import check_output
     from heliograph.disk.quoting import visible
-    from heliograph.disk.whole_file import whole_file
+    from heliograph.disk.whole_file import check_output, whole_file
     from heliograph.numerics.check import fail
 
     check_output(file, (".py",))

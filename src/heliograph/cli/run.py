@@ -179,7 +179,7 @@ def _claim(estimate: "Estimate") -> str:
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
     """Check before the work starts that files can be written."""
-    from heliograph.disk.output_file import FORMATS, check_output
+    from heliograph.disk.whole_file import FORMATS, check_output
     from heliograph.numerics.check import fail
 
     if out is not None:
@@ -187,7 +187,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.disk.output_file import check_replaceable
+        from heliograph.disk.whole_file import check_replaceable
         from heliograph.report.results import NEEDS, SUMMARY
 
         for name in NEEDS:

@@ -39,7 +39,7 @@ def explore(
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
     from heliograph.campaign.explore import explore_results
-    from heliograph.disk.output_file import check_output_folder
+    from heliograph.disk.whole_file import check_output_folder
 
     check_output_folder(out)
     page = explore_results(results, out)

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from heliograph.codegen.c_source import Real
-from heliograph.disk.output_file import check_output
-from heliograph.disk.whole_file import whole_files
+from heliograph.disk.whole_file import check_output, whole_files
 from heliograph.export.program import step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.filters.base import AbstractFilter

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.output_file import check_output
-from heliograph.disk.whole_file import whole_file
+from heliograph.disk.whole_file import check_output, whole_file
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import fail, instance, text
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.results.record import Record
 

@@ -10,7 +10,7 @@ from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.network import Network
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.disk.output_file import FORMATS
+from heliograph.disk.whole_file import FORMATS
 from heliograph.files.event_table import EventTable
 from heliograph.files.recording import TIME_STEP, write_estimates
 from heliograph.live.event import INPUTS, Event, whole

@@ -13,8 +13,8 @@ from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
-from heliograph.numerics.readable import readable
-from heliograph.numerics.unit import with_unit
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import with_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

@@ -17,7 +17,7 @@ from heliograph.files.recording import TIME_STEP
 from heliograph.live.event import INPUTS, whole
 from heliograph.numerics.check import fail, scalar, shown, text
 from heliograph.numerics.dates import UNITS, dates, instant
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 

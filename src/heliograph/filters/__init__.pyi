@@ -15,7 +15,7 @@ from .gaussian.correction import (
 from .wrappers.delay import (
     late_filter as late_filter,
 )
-from .wrappers.part import (
+from .wrappers.delay import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (
@@ -37,7 +37,7 @@ from .linear.linear import (
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )
-from .linear.open_loop import (
+from .gaussian.belief import (
     open_loop_filter as open_loop_filter,
 )
 from .modes.mixture import (
@@ -56,7 +56,7 @@ from .linear.polynomial import (
     memory_filter as memory_filter,
     scheduled_polynomial_filter as scheduled_polynomial_filter,
 )
-from .wrappers.prediction import (
+from .wrappers.fed_back import (
     prediction_of as prediction_of,
 )
 from .modes.mode_observed import (

@@ -18,9 +18,8 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.names import offered
-from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import (
+from heliograph.numerics.linalg import (
     NEGATIVE_TOLERANCE,
     add,
     diagonal_of,
@@ -21,6 +20,7 @@ from heliograph.numerics.small_matrix import (
     squared_distance,
     squared_distances,
 )
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Float, PyTree
 
 LIMIT = 1e6

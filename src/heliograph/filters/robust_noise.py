@@ -12,9 +12,9 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
+from heliograph.numerics.linalg import add, times_vector
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import add, times_vector
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array
 from heliograph.random_affine.atoms import GainAndNoise

@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from heliograph.filters.gaussian.scores import AbstractWeights, Expected, reweighted, squared_residuals
 from heliograph.numerics.check import TINY, check_count, scalar
-from heliograph.numerics.small_matrix import diagonal_of
+from heliograph.numerics.linalg import diagonal_of
 from heliograph.numerics.types import ArrayLike
 
 Number = Float[jax.Array | np.ndarray, ""]

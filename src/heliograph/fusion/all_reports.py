@@ -13,8 +13,7 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import solve_known
-from heliograph.numerics.linalg import symmetrize
-from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.linalg import symmetrize, with_rounding
 from heliograph.numerics.types import Float
 
 

@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.linear.plan import Plan
-from heliograph.numerics.linalg import cholesky, symmetrize
-from heliograph.numerics.small_matrix import rounding
+from heliograph.numerics.linalg import cholesky, rounding, symmetrize
 from heliograph.numerics.types import Array, Float
 
 SAME = 1e-13  # relative: two matrices that say the same after a few products

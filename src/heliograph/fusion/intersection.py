@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.over_runs import runs_last, runs_last_of
-from heliograph.numerics.small_matrix import (
+from heliograph.numerics.linalg import (
     add,
     diagonal,
     factor,
@@ -21,6 +20,7 @@ from heliograph.numerics.small_matrix import (
     trace,
     transpose,
 )
+from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.types import Float
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13

@@ -10,8 +10,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Numbers = TypeAliasType("Numbers", Float[Array, "*n"])

@@ -10,8 +10,7 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, fail, instance, probabilities, rank
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 

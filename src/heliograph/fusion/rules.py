@@ -25,8 +25,7 @@ from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, check_count, fail, instance, items, probabilities, scalar
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 Means = Float[jax.Array, "count n"]

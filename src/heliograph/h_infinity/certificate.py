@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
 from heliograph.h_infinity.system import GrowthSystem, smallest_eigenvalue, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, items, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 FINDINGS = "findings of check_growth or check_size"

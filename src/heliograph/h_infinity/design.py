@@ -23,7 +23,7 @@ from heliograph.h_infinity.solver import (
 from heliograph.h_infinity.step import Layout, StepMatrices, Unknowns, all_multipliers, next_energy, step_matrices
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 SEARCH_ACCURACY = 1e-4  # relative, of a level found by bisection

@@ -13,7 +13,7 @@ from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
 from heliograph.numerics.check import array, check_seed, fail, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 POINTS = 2**12  # of a low-discrepancy sequence, at which slopes are taken

@@ -8,7 +8,7 @@ from typing_extensions import TypeAliasType
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units, rank, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.disturbance import DisturbedGain, disturbed_gain

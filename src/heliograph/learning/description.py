@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.learning.free_marks import Asking, Build, Given, reading
 from heliograph.learning.parameters import Parameters, plain_number
 from heliograph.numerics.check import fail, function, instance, shown_error
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 

@@ -17,7 +17,7 @@ from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 

@@ -10,8 +10,19 @@ from typing_extensions import TypeAliasType
 
 from heliograph.learning.likelihood.transforms import to_line
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.numerics.check import array, fail, rank, shown
-from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
+from heliograph.numerics.check import (
+    COVARIANCE,
+    POSITIVE,
+    PROBABILITY,
+    REAL,
+    SIMPLEX,
+    Domain,
+    array,
+    fail,
+    marked,
+    rank,
+    shown,
+)
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 

@@ -12,7 +12,7 @@ from heliograph.learning.likelihood.predictive_density import Predictive, predic
 from heliograph.learning.long_run import mean_and_error
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError, fail, instance
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

@@ -16,9 +16,9 @@ from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import congruence, contract, factor
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.linalg import congruence, contract, factor
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.moments.second_moments import second_order
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.learning.likelihood.transforms import from_line, size, slope, to_line, unlink_slope
-from heliograph.numerics.domain import POSITIVE, PROBABILITY, REAL, Domain
-from heliograph.numerics.readable import readable
+from heliograph.numerics.check import POSITIVE, PROBABILITY, REAL, Domain
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
 
 

@@ -15,9 +15,8 @@ from heliograph.learning.likelihood.surface import DIFFERENCE
 from heliograph.learning.likelihood.transforms import unlink
 from heliograph.learning.parameters import Parameters
 from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 SEEN = 0.05  # information of a coordinate below which the number has run to a limit

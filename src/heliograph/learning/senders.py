@@ -13,7 +13,7 @@ from heliograph.learning.description import Description
 from heliograph.learning.likelihood.recordings import gathered
 from heliograph.learning.solution import TWO_SIDED, Row
 from heliograph.numerics.check import fail
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.network import Network

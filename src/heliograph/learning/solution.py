@@ -12,7 +12,7 @@ from heliograph.learning.likelihood.surface import REACH, Surface
 from heliograph.learning.likelihood.transforms import link, unlink
 from heliograph.learning.parameters import Entry, Parameters
 from heliograph.learning.ridges import Rank, rank_of
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float
 
 ONE_SIDED = 1.3528  # half the 90 % point of chi-square with one degree of freedom: 95 % on one side

@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
+from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
-from heliograph.filters.linear.open_loop import open_loop_filter
 from heliograph.learning.likelihood.predictive_density import NODES, Parts, expected_signals, of_signals
 from heliograph.learning.long_run import long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.readable import readable
-from heliograph.numerics.same import same
+from heliograph.numerics.module import readable, same
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import arrived

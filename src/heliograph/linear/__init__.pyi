@@ -1,10 +1,10 @@
 """Public names of the room; the package loads them when first used."""
 
-from .arrival import (
+from .steady_state import (
     CriticalArrival as CriticalArrival,
     critical_arrival as critical_arrival,
 )
-from .comparison import (
+from .polynomial import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,
 )
@@ -18,7 +18,7 @@ from .recursion import (
     lmmse as lmmse,
     true_covariance as true_covariance,
 )
-from .schedule import (
+from .system import (
     Gains as Gains,
     Schedule as Schedule,
     load_schedule as load_schedule,

@@ -1,4 +1,4 @@
-"""A linear model lifted to monomials: powers of the state and of the measurement as one linear system."""
+"""A linear model lifted to monomials: powers of the state and of the measurement, and modes, as one linear system."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
@@ -6,28 +6,119 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.modal_lift import lifted_modes
-from heliograph.linear.moments_over_time import SteadyMoments, check_moments
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
-from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.linalg import with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents, position
 from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
 
-T = TypeVar("T")
 EPS = float(np.finfo(np.float64).eps)
+
+Moments = Float[np.ndarray, " monomials"]  # of (x, 1), all of one order
+
+
+def check_moments(moments: Moments, k: int, order: int) -> None:
+    """Raise ValueError where moments of the state after step k are no finite numbers."""
+    if not np.all(np.isfinite(moments)):
+        got = f"ones beyond doubles at step {k + 1}: use a shorter horizon, or units in which the state is smaller"
+        raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
+
+
+class SteadyMoments:
+    """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
+
+    What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)
+    times as much. Moments are steady once that is below the rounding of their own scale, E[x_i^2]^(1/2) for each x_i.
+    """
+
+    def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
+        rate = 1 - float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate
+        n, places = len(matrix), position(len(matrix) + 1, order)
+        self._powers = np.array(exponents(n + 1, order))[:, :n]
+        self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
+        self._last: Moments | None = None
+
+    def stays(self, moments: Moments) -> bool:
+        """Return whether the moments are those of the call before, to rounding."""
+        before, self._last = self._last, moments
+        if before is None or self._tolerance < 0:
+            return False
+        scale = np.prod(np.sqrt(np.abs(moments[self._squares])) ** self._powers, axis=1)
+        return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
+
+
+def lifted_modes(
+    plants: Sequence[GainAndNoise],
+    measurements: Sequence[JointModes],
+    degree: int,
+    moments: Float[np.ndarray, " monomials"],
+    projection: Float[np.ndarray, "n L"],
+) -> LinearSystem:
+    """The system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
+
+    E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
+    and of the route in mode j. Noises, with B = E[Y Y']:
+    Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'),
+    Cov(v) = sum_j p_j (E[Z Z' | j] - K_j B+ K_j').
+
+    `plants` and `measurements` (from x+ to z) of each step; `moments` of x_0 up to 2 degree; `projection` reads x off
+    Y.
+    """
+    n, modes = plants[0].inputs, len(measurements[0].initial)
+    law, rows = np.asarray(measurements[0].initial), np.eye(modes)
+    before = second_moments(moments, n + 1, degree)
+    mean = np.kron(law, before[:, -1])
+    start = np.kron(np.diag(law), before) - np.outer(mean, mean)
+    parts, rounding, earlier = [], [], law
+    distinct = {id(measurement): measurement for measurement in measurements}
+    of_modes = {place: item.moments(degree) for place, item in distinct.items()}
+    of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
+    # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
+    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
+    for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
+        if steady.stays(moments) and np.array_equal(law, earlier) and k > 1:
+            break
+        earlier = law
+        moved, means = of_plant[id(plant)], of_modes[id(measurement)]
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            moments = np.asarray(push(plant, 2 * degree, moments))
+        check_moments(moments, k, 2 * degree)
+        after, carried = second_moments(moments, n + 1, degree), moved @ before @ moved.T
+        chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
+        law = _stays(law, law @ rows)
+        process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
+        noise = np.zeros((1, 1))
+        for p, matrix, route in zip(law, means, measurement.maps, strict=True):
+            arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
+            noise = noise + p * (np.asarray(arrives) - matrix @ after @ matrix.T)
+        output = np.concatenate(list(means), axis=1)[:-1]
+        zero = np.zeros(len(mean)), np.zeros(len(output))
+        parts.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
+        rounding.append(EPS * np.kron(law, np.diag(after)))
+        before, rows = after, np.asarray(measurement.transition)
+    steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*parts, strict=True)))
+    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
+
+
+def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
+    """The law after a step; itself where it only flips last bits."""
+    return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
+
+
+T = TypeVar("T")
 HIGHEST = 31  # degree: C(62, 31) is below 2^63
 KEPT_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 

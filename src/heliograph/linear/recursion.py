@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.schedule import Gains, Schedule
-from heliograph.linear.system import LinearSystem, Steps, over_horizon
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
-from heliograph.numerics.small_matrix import PRECISE, with_rounding
+from heliograph.numerics.linalg import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring

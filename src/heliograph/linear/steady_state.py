@@ -1,20 +1,139 @@
-"""Steady state of the Kalman filter: its covariances and its gain in the long run, before any data."""
+"""Long run of Kalman filters: steady covariances and gains, and how often packets must arrive for them to exist."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from heliograph.linear.arrival import plant_matrices, sensor_matrices
-from heliograph.linear.known_losses import spectral_radius
+from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import Steps
-from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
-from heliograph.numerics.check import fail, own_units
-from heliograph.numerics.readable import readable
-from heliograph.numerics.types import Float
+from heliograph.model.of_inputs import OfInputs
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
+from heliograph.numerics.check import array, fail, own_units
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.noise import AbstractNoise
+
+RESOLUTION = 1e-8  # of an arrival probability
+
+
+@readable
+class CriticalArrival(NamedTuple):
+    """Arrival probabilities: at `lower` and below the mean error of every filter diverges, above `upper` it is bounded.
+
+    Between the two, nothing is proved here. `gain` K (n, m) of xhat+ = A xhat + K (z - C xhat) is certified from
+    `upper` on. (0, 0) for a stable plant.
+    """
+
+    lower: float
+    upper: float
+    gain: Float[np.ndarray, "n m"]
+
+
+def critical_arrival(
+    plant: AnyPlant, sensor: AnySensor, gain: "Float[ArrayLike, 'n m'] | None" = None
+) -> CriticalArrival:
+    """Return critical probabilities that a packet of all outputs arrives, independently at each step.
+
+    The receiver knows of losses. lower = 1 - 1/rho(A)^2: while nothing arrives P grows by rho(A)^2 a step. upper: the
+    smallest arrival at which some K passes rho((1 - arrival) A x A + arrival (A - K C) x (A - K C)) < 1. With as many
+    independent outputs as states they meet. Known in the field, and not proved here: where the unstable eigenvalues
+    have distinct moduli, `lower` is the truth (You, Fu and Xie, 2011; Mo and Sinopoli, 2012). Process noise must reach
+    the unstable modes for anything to diverge.
+
+    Args:
+        plant: linear plant, constant over time.
+        sensor: linear sensor, constant over time.
+        gain: constant filter gain K (n, m) of xhat+ = A xhat + K (z - C xhat); both probabilities are then the arrival
+            from which on its error is bounded. None: the best gains.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear or varies, a sensor that misses an unstable mode, a gain that
+            does not stabilise where everything arrives.
+    Source: Sinopoli et al., Kalman filtering with intermittent observations, IEEE TAC 49 (2004), Theorems 2 to 5.
+    """
+    a, q = plant_matrices(plant)
+    c, r = sensor_matrices(sensor, len(a))
+    fixed = None if gain is None else np.asarray(array("gain", gain, (len(a), len(c))))
+    lost = np.zeros((0, len(a)))
+
+    def gain_at(arrival: float) -> Float[np.ndarray, "n m"] | None:
+        """A certified gain, or None."""
+        # Independent losses as a chain of two modes with equal rows: arrived, lost.
+        chain = np.array([[arrival, 1 - arrival]] * 2)
+        system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
+        gains = find_gains(system) if fixed is None else (fixed, lost.T)
+        return gains[0] if certified_radius(system, gains) < BELOW_ONE else None
+
+    radius = spectral_radius(a)
+    if radius < BELOW_ONE and fixed is None:
+        return CriticalArrival(0.0, 0.0, np.zeros((len(a), len(c))))
+    # Lower bound 1 - rho(A)^-2.
+    lower = max(1 - radius**-2, 0.0)
+    if gain_at(1.0) is None:
+        what = "sensor" if fixed is None else "gain"
+        raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
+    # Upper bound: bisection over certified gains.
+    upper, result = _smallest(gain_at, lower)
+    return CriticalArrival(lower if fixed is None else upper, upper, result)
+
+
+def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
+    """The smallest arrival with a certified gain, by bisection, and that gain; `lower` itself if it is that close."""
+    near, result = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
+    if near is not None:
+        return lower, near
+    low, high = lower, 1.0
+    while high - low > RESOLUTION / 10:
+        middle = (low + high) / 2
+        candidate = gain_at(middle)
+        low, high, result = (middle, high, result) if candidate is None else (low, middle, candidate)
+    assert result is not None
+    return high, result
+
+
+def plant_matrices(
+    plant: AnyPlant, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+    """A and Cov(w) of a constant linear plant, for `what` needs them.
+
+    Raises:
+        ValueError: another plant.
+    """
+    if (
+        not isinstance(plant, LinearPlant)
+        or not isinstance(plant.noise, AbstractNoise)
+        or isinstance(plant.matrix, OfInputs)
+    ):
+        raise fail(what, "a LinearPlant that does not vary", _kind(plant))
+    refuse_angles(what, plant)
+    return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
+
+
+def sensor_matrices(
+    sensor: AnySensor, states: int, what: str = "boundedness"
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
+    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them.
+
+    Raises:
+        ValueError: another sensor.
+    """
+    if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
+        raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
+    check_sensor(sensor, states)
+    refuse_angles(what, sensor)
+    return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
+
+
+def _kind(item: AnyPlant | AnySensor) -> str:
+    if isinstance(item, OverTime):
+        return "one that varies"
+    return f"one that varies with {list(item.inputs)}" if isinstance(item, LinearPlant) else type(item).__name__
+
 
 CLOSE = 1e-8  # relative: what one more step of the Riccati recursion may change
 

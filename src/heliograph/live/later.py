@@ -17,7 +17,7 @@ from heliograph.live.row_step import NetworkStep
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import Fused

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.codegen.engine import chosen
 from heliograph.live.static import Static, cast
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.judging import implausible, plausible_step, step_without

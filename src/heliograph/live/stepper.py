@@ -14,7 +14,7 @@ from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.filters.base import AbstractFilter
 from heliograph.live.static import Static
-from heliograph.numerics.compiler import understood
+from heliograph.numerics.float64 import understood
 from heliograph.numerics.types import Float, PyTree
 
 Leaves = list[np.ndarray]

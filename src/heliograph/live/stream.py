@@ -17,7 +17,7 @@ from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.numerics.check import fail
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, PyTree
 
 

@@ -18,7 +18,7 @@ from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
 from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Square, Vector

@@ -6,8 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, own_units, shown
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float
 
 Claim = Literal["exact", "upper", "nominal", "none"]

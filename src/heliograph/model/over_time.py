@@ -11,8 +11,7 @@ from jaxtyping import Array, Int
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import one_memory
 

@@ -14,8 +14,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (

@@ -10,8 +10,7 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_moment_tensor

@@ -14,8 +14,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 

@@ -7,10 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar, shown
-from heliograph.numerics.domain import POSITIVE, tell
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.check import POSITIVE, TINY, array, check_count, covariance, fail, rank, scalar, shown, tell
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float
 

@@ -1,20 +1,323 @@
 """Small symmetric matrices: products, factors and solves, fast for batches of runs."""
 
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial, reduce
+from operator import sub
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.custom_batching import sequential_vmap
-from jaxtyping import Array, Float
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float
 
 from heliograph.numerics.over_runs import runs_last, runs_last_of
-from heliograph.numerics.small_matrix import UNROLL_LIMIT, factor, long_factor, solve
+from heliograph.numerics.types import Array
+
+UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
+PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
+NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
+PRECISE = 1e-7  # of a measurement's variance: noise below it costs the short form P - K C half of the digits
+OFF_SUPPORT = 1e-6  # standard deviations, and
+OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
+
+A = TypeVar("A", jax.Array, np.ndarray)
 
 
-def symmetrize(a: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
+def transpose(a: Array) -> jax.Array:
+    """A', (n, m, ...)."""
+    return jnp.swapaxes(a, 0, 1)
+
+
+def symmetric(a: jax.Array) -> jax.Array:
+    """A symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
+
+    Native code does not compute the lower one.
+    """
+    n = len(a)
+    upper = np.triu(np.ones((n, n), bool)).reshape(n, n, *[1] * (a.ndim - 2))
+    return jnp.where(upper, a, transpose(a))
+
+
+def add(terms: Sequence[Array]) -> jax.Array:
+    """Sum of terms one by one: a library reduction over a short axis costs more than all its additions."""
+    return jnp.asarray(sum(terms[1:], terms[0]))
+
+
+def minus(whole: jax.Array, parts: Iterable[jax.Array]) -> jax.Array:
+    """Subtract all `parts` from `whole`, one by one."""
+    return reduce(sub, parts, whole)
+
+
+def summed(a: jax.Array, axis: int) -> jax.Array:
+    """Sum over a short axis, one by one."""
+    return jnp.asarray(lax.squeeze(reduce(lax.add, lax.split(a, (1,) * a.shape[axis], axis)), (axis,)))
+
+
+def times(a: Array, b: jax.Array) -> jax.Array:
+    """A B, as a sum of columns of A times rows of B."""
+    inner = b.shape[0]
+    if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
+        return jnp.einsum("ij...,jk...->ik...", a, b)
+    columns, rows = lax.split(a, (1,) * inner, 1), lax.split(b, (1,) * inner)
+    return add([column * row for column, row in zip(columns, rows, strict=True)])
+
+
+def times_vector(a: Array, x: jax.Array) -> jax.Array:
+    """A x."""
+    return jnp.asarray(lax.squeeze(times(a, lax.expand_dims(x, (1,))), (1,)))
+
+
+def congruence(a: Array, p: jax.Array) -> jax.Array:
+    """A P A' for a symmetric P."""
+    return symmetric(times(times(a, p), transpose(a)))
+
+
+def inner(a: jax.Array, b: jax.Array) -> jax.Array:
+    """tr(A' B)."""
+    products = a * b
+    return summed(products.reshape(-1, *products.shape[2:]), 0)
+
+
+def trace(a: jax.Array) -> jax.Array:
+    """tr A."""
+    return summed(diagonal_of(a), 0)
+
+
+def diagonal_of(a: jax.Array) -> jax.Array:
+    """The diagonal of A, (n, ...): each component's own entry."""
+    n = a.shape[0]
+    return lax.slice_in_dim(a.reshape(n * n, *a.shape[2:]), 0, n * n, n + 1)
+
+
+def identity(n: int, like: jax.Array) -> np.ndarray:
+    """I (n, n, 1, ...) of as many axes and of the precision of another array."""
+    return np.eye(n, dtype=like.dtype).reshape(n, n, *[1] * (like.ndim - 2))
+
+
+def diagonal(d: jax.Array) -> jax.Array:
+    """diag(d)."""
+    return d[None] * identity(d.shape[0], d[None])
+
+
+def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
+    """A relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
+    return max(tolerance, units * float(np.finfo(like.dtype).eps))
+
+
+def with_rounding(p: A, terms: int) -> A:
+    """P with (terms + 2) units of rounding more of each variance: what a difference P - B'B of so many terms may miss.
+
+    So what a precise measurement leaves is never less than nothing. P (n, n, ...), NumPy's or JAX's.
+    """
+    units = (terms + 2) * float(np.finfo(p.dtype).eps)
+    return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
+
+
+def sum_of_squares(
+    prior: jax.Array, prior_root: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array
+) -> jax.Array:
+    """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added.
+
+    By roots of P and of N, so that what I - K H takes off, and what K takes of a singular N, leave the squares of their
+    rounding alone, which are not negative.
+    """
+    n = len(prior)
+    stored = identity(n, prior) - times(gain, output)
+    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * diagonal_of(prior))
+    left = times(stored, prior_root)
+    return symmetric(times(left, transpose(left)) + spread_of(gain, noise)) + rounded
+
+
+@jax.custom_jvp
+def spread_of(gain: jax.Array, noise: jax.Array) -> jax.Array:
+    """K N K' of a positive semidefinite N as a square, by a root of N; its derivatives are those of the product."""
+    part = times(gain, root(noise))
+    return times(part, transpose(part))
+
+
+@spread_of.defjvp
+def _spread_jvp(
+    primals: tuple[jax.Array, jax.Array], tangents: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    (gain, noise), (gain_dot, noise_dot) = primals, tangents
+    half = times(times(gain_dot, noise), transpose(gain))
+    return spread_of(gain, noise), half + transpose(half) + congruence(gain, noise_dot)
+
+
+def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Columns of the lower factor, (n, ...) each, and the reciprocals of its diagonal (zero for a zero column).
+
+    Column by column: what is left of a column after those before it, times the reciprocal root of its pivot. A pivot is
+    judged by the component's own diagonal entry, so that units do not decide what is singular.
+    """
+    columns: list[jax.Array] = []
+    scales: list[jax.Array] = []
+    for j in range(a.shape[0]):
+        rest = minus(a[j:, j], (c[j:] * c[j] for c in columns))
+        scales.append(pivot_scale(rest[0], a[j, j]))
+        columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
+    return columns, scales
+
+
+def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
+    """1 / root of a pivot; 0 for one that is zero up to rounding of the whole diagonal entry, NaN for a negative one.
+
+    The root is taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
+    """
+    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole
+    beyond = jnp.where(singular, jnp.inf, jnp.nan)
+    return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
+
+
+def solve(a: jax.Array, b: jax.Array) -> jax.Array:
+    """X with A X = B for a positive semidefinite A and B in its range; NaN for an indefinite A.
+
+    A component that those before it determine gets zeros: B' X is B' A^+ B whatever is chosen there.
+    """
+    return solver(a)(b)
+
+
+def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """`solve` of one A for several B, one after another: it is factored once."""
+    n = a.shape[0]
+    if n > UNROLL_LIMIT:
+        return partial(_over_matrices, _long_solve, a)
+    columns, scales = factor(a)
+
+    def solved(b: jax.Array) -> jax.Array:
+        forward: list[jax.Array] = []
+        for i in range(n):  # L Y = B
+            forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
+        backward = forward[:]
+        for i in reversed(range(n)):  # L' X = Y
+            backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
+        return jnp.stack(backward)
+
+    return solved
+
+
+def long_factor(a: jax.Array) -> jax.Array:
+    """The lower factor of one larger matrix by the same rule."""
+    n, whole = a.shape[-1], jnp.diagonal(a)
+
+    def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        a, done = carry
+        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], whole[j]), 0.0)
+        return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
+
+    result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
+    return result
+
+
+def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
+    lower = long_factor(a)
+    none = jnp.diagonal(lower) == 0
+    lower = lower + jnp.diag(none.astype(lower.dtype))
+    forward = jnp.where(none[:, None], 0.0, solve_triangular(lower, b, lower=True))
+    return jnp.asarray(solve_triangular(lower, forward, lower=True, trans=1))
+
+
+def root(a: jax.Array) -> jax.Array:
+    """R, lower, with R R' = A for a positive semidefinite A, a column of zeros where a component adds nothing."""
+    if len(a) > UNROLL_LIMIT:
+        return _over_matrices(lambda a, _: long_factor(a), a, a)
+    return jnp.stack(factor(a)[0], axis=1)
+
+
+def pivots(a: jax.Array) -> jax.Array:
+    """Variance of each component given those before it, (n, ...); 0 where these determine it."""
+    return diagonal_of(a) if len(a) == 1 else diagonal_of(root(a)) ** 2
+
+
+def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
+    """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
+
+    A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
+    say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
+    """
+    return add(list(squared_distances(a, x, size)[0]))
+
+
+def squared_distances(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
+    """The terms of `squared_distance`, each given those before it, and which of them these determine."""
+    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(diagonal_of(a), 0.0)) + OFF_VALUE * jnp.abs(size)
+    squares: list[jax.Array] = []
+    determined: list[jax.Array] = []
+    for i, (rest, scale) in enumerate(_substituted(a, x)):
+        agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
+        determined.append(scale == 0)
+        squares.append(jnp.where(determined[-1], agrees, (rest * scale) ** 2))
+    return jnp.stack(squares), jnp.stack(determined)
+
+
+def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
+    """L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
+    return jnp.stack([jnp.where(scale == 0, jnp.nan, rest * scale) for rest, scale in _substituted(a, x)])
+
+
+def uncorrelated(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """T B and the diagonal D of T A T', for a positive semidefinite A; T has ones on its diagonal and zeros above."""
+    n, shape = len(a), jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
+    b = jnp.broadcast_to(b, (*b.shape[:2], *shape))
+    if n > UNROLL_LIMIT:
+        lower = root(a)
+        scales = _reciprocals(diagonal_of(lower))
+        unit = lower * scales + diagonal(jnp.where(scales == 0, 1.0, 0.0))
+        rows = _over_matrices(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
+    else:
+        rests, items = zip(*_substituted(a, b), strict=True)
+        rows, scales = jnp.stack(rests), jnp.stack(items)
+    return rows, _reciprocals(scales * scales)
+
+
+def _reciprocals(a: jax.Array) -> jax.Array:
+    """1 / a, and 0 for 0."""
+    return jnp.where(a == 0, 0.0, 1 / jnp.where(a == 0, 1.0, a))
+
+
+def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """Return numerators x_i - sum_j L_ij y_j and reciprocals 1 / L_ii of forward substitution; y_i is their product."""
+    n = a.shape[0]
+    if n > UNROLL_LIMIT:
+        lower = root(a)
+        columns, scales = list(jnp.moveaxis(lower, 1, 0)), list(_reciprocals(diagonal_of(lower)))
+    else:
+        columns, scales = factor(a)
+    forward: list[jax.Array] = []
+    rests: list[jax.Array] = []
+    for i in range(n):  # L y = x
+        rests.append(minus(x[i], (columns[j][i] * forward[j] for j in range(i))))
+        forward.append(rests[i] * scales[i])
+    return list(zip(rests, scales, strict=True))
+
+
+def _over_matrices(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
+    """A function of two single matrices, for each of the further axes."""
+    shape = jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
+    a, b = (jnp.broadcast_to(x, (*x.shape[:2], *shape)) for x in (a, b))
+    for _ in shape:
+        function = jax.vmap(function, in_axes=-1, out_axes=-1)
+    return function(a, b)
+
+
+def contract(tensor: Array, matrix: jax.Array) -> jax.Array:
+    """sum_ab T_ijab W_ab."""
+    n = matrix.shape[0]
+    if n > UNROLL_LIMIT // 2:
+        return jnp.einsum("ijab...,ab...->ij...", tensor, matrix)
+    flat = jnp.asarray(tensor).reshape(*tensor.shape[:2], n * n, *tensor.shape[4:])
+    return summed(flat * matrix.reshape(n * n, *matrix.shape[2:]), 2)
+
+
+def symmetrize(a: Float[jax.Array, "... n n"]) -> Float[jax.Array, "... n n"]:
     """Return (A + A') / 2."""
     return jnp.asarray((a + jnp.swapaxes(a, -1, -2)) / 2)
 
 
-def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def cholesky(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
     """Lower factor L of a positive semidefinite matrix, A = L L'.
 
     A pivot that is zero to rounding of its own diagonal entry gives a zero column, so a singular covariance (a
@@ -31,7 +334,7 @@ def _short_cholesky(a: jax.Array) -> jax.Array:
     return jnp.stack(factor(a)[0], axis=1)
 
 
-def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n k"]:
+def psd_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:
     """Solve A X = B for a positive semidefinite A and B in its range.
 
     Of a component that those before it determine, X is zero. An indefinite A gives NaN.
@@ -44,7 +347,7 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n
 _solve = runs_last(solve)
 
 
-def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
 
     A batch at once is dealt out to the processor's threads by a call that waits for them on one of them: programs that
@@ -54,7 +357,7 @@ def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"
     return values, vectors
 
 
-def regular_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n k"]:
+def regular_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:
     """Solve A X = B for a regular A; of a batch one after another, as `eigh`."""
     return jnp.asarray(_regular_solve(a, b))
 

@@ -1,6 +1,60 @@
-"""Base class of all models, filters and rules: trees of arrays, with methods that cost no more than a call."""
+"""Base class of all models, filters and rules; text and equality of the package's objects, one way for all of them."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import partial
+from html import escape
+from itertools import islice
+from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def same(item: Any, other: Any) -> bool:
+    """Return one bool for objects that hold arrays: of the same class, and the same in each part.
+
+    Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
+    same as itself alone.
+    """
+    if item is other:
+        return True
+    if isinstance(item, jax.core.Tracer) or isinstance(other, jax.core.Tracer):
+        return False
+    if isinstance(item, np.ndarray | np.generic | jax.Array) and isinstance(other, np.ndarray | np.generic | jax.Array):
+        return _same_array(item, other)
+    if type(item) is not type(other):
+        return False
+    # Containers and dataclasses, part by part.
+    if isinstance(item, Mapping):
+        return item.keys() == other.keys() and all(same(item[key], other[key]) for key in item) and _rest(item, other)
+    if isinstance(item, tuple | list):
+        return len(item) == len(other) and all(map(same, item, other))
+    if isinstance(item, partial):
+        return same((item.func, item.args, item.keywords), (other.func, other.args, other.keywords))
+    if is_dataclass(item):
+        return all(same(getattr(item, f.name, None), getattr(other, f.name, None)) for f in fields(item) if f.compare)
+    # Objects without an equality of their class are compared by their attributes.
+    kind: Any = type(item)
+    if kind.__eq__ is object.__eq__ and not callable(item) and getattr(item, "__dict__", None):
+        return same(vars(item), vars(other))  # nobody has said when two of these are equal
+    return bool(item == other) or (isinstance(item, float) and item != item and other != other)
+
+
+def _rest(item: object, other: object) -> bool:
+    """Compare the attributes that a subclass of dict has in addition to its entries."""
+    return same(getattr(item, "__dict__", None), getattr(other, "__dict__", None))
+
+
+def _same_array(item: Any, other: Any) -> bool:
+    if item.shape != other.shape or item.dtype != other.dtype:
+        return False
+    if jnp.issubdtype(item.dtype, jax.dtypes.prng_key):
+        item, other = jax.random.key_data(item), jax.random.key_data(other)
+    a, b = np.asarray(item), np.asarray(other)
+    return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))
 
 
 class Module(eqx.Module):
@@ -12,3 +66,122 @@ class Module(eqx.Module):
     """
 
     __getattribute__ = object.__getattribute__
+
+
+T = TypeVar("T", bound=type)
+E = TypeVar("E")
+
+WIDTH, LINES, DEPTH = 110, 10, 3  # characters, lines and levels of what is shown
+FEW, SOME, LARGE = 4, 8, 20  # numbers of an array, items on a line, rows of a table
+
+
+def readable(kind: T) -> T:
+    """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer."""
+    for name, method in (("__repr__", _repr), ("_repr_html_", _html), ("__eq__", _equal)):
+        setattr(kind, name, method)
+    return kind
+
+
+def _repr(self: object) -> str:
+    """One line, or a line for each part."""
+    whole = line(self, DEPTH)
+    if len(whole) <= WIDTH:
+        return whole
+    parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_parts(self), LINES - 2)]
+    left = sum(1 for _ in _parts(self)) - len(parts)
+    more = [f"  … {left} more"] if left else []
+    return "\n".join([f"{type(self).__name__}(", *(cut(part) for part in (*parts, *more)), ")"])
+
+
+def _html(self: object) -> str:
+    """A table of the parts; what has parts itself opens where it stands."""
+    return _table(self, DEPTH)
+
+
+def _equal(self: object, other: object) -> bool:
+    """Return whether both are of the same class and equal in every part; NaN equals NaN."""
+    if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
+        return same(self.__getstate__(), other.__getstate__())
+    return same(self, other)
+
+
+def line(value: object, depth: int) -> str:
+    """Return any value on one line: arrays by their size, what lies deeper than `depth` by its class name."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _array(value)
+    # Containers, item by item.
+    if isinstance(value, Mapping) and not _ours(value):
+        return _joined(
+            "{", value.items(), len(value), depth, lambda item: f"{item[0]!r}: {line(item[1], depth - 1)}", "}"
+        )
+    if isinstance(value, tuple | list) and not _ours(value):
+        marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
+        return _joined(marks[0], value, len(value), depth, lambda item: line(item, depth - 1), marks[1])
+    # Objects with fields.
+    if _ours(value) or is_dataclass(value):
+        name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
+        return _joined(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
+    if isinstance(value, partial):
+        return line(value.func, depth)
+    if callable(value):
+        return str(getattr(value, "__name__", type(value).__name__))
+    return " ".join(repr(value).split())
+
+
+def _ours(value: object) -> bool:
+    return getattr(type(value), "__repr__", None) is _repr
+
+
+def _parts(value: object) -> Iterable[tuple[str, object]]:
+    """Names and values of what an object holds and anybody may use."""
+    if isinstance(value, Mapping):
+        return ((repr(key), item) for key, item in value.items())
+    if is_dataclass(value):
+        named = ((field.name, getattr(value, field.name, None)) for field in fields(value))
+    else:
+        named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
+    return ((name, item) for name, item in named if not name.startswith("_"))
+
+
+def _array(value: np.ndarray | np.generic | jax.Array) -> str:
+    if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
+        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
+    numbers = np.asarray(value).tolist()
+    return repr(numbers) if value.dtype.kind != "f" else _rounded(numbers)
+
+
+def _rounded(numbers: object) -> str:
+    if isinstance(numbers, list):
+        return f"[{', '.join(map(_rounded, numbers))}]"
+    return f"{numbers:.4g}"
+
+
+def _joined(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
+    if count and depth <= 0:
+        return f"{start}…{end}"
+    more = [f"… {count - SOME} more"] if count > SOME else []
+    return f"{start}{', '.join([*map(of, islice(items, SOME)), *more])}{end}"
+
+
+def cut(text: str) -> str:
+    """Return a line of at most WIDTH characters."""
+    return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
+
+
+def _table(value: object, depth: int) -> str:
+    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(item, depth - 1)}</td></tr>" for name, item in _entries(value)]
+    return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
+
+
+def _entries(value: object) -> Iterable[tuple[str, object]]:
+    result = _parts(value)
+    yield from islice(result, LARGE)
+    left = sum(1 for _ in result)
+    if left:
+        yield "…", f"{left} more"
+
+
+def _cell(value: object, depth: int) -> str:
+    text = escape(cut(line(value, depth)))
+    opens = _ours(value) or (isinstance(value, Mapping) and value)
+    return f"<details><summary>{text}</summary>{_table(value, depth)}</details>" if opens and depth > 0 else text

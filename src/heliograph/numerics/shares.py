@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import norm
 
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 
 
 @readable

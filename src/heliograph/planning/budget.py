@@ -6,8 +6,7 @@ from typing import NamedTuple, SupportsFloat, cast
 import numpy as np
 
 from heliograph.numerics.check import fail, instance, scalar, table
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
 MET = 1e-9  # relative excess over a limit that counts as met

@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import amplify_and_forward
 from heliograph.numerics.check import array, fail, function, instance
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign

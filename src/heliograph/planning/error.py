@@ -7,8 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import array, check_count, covariance, fail, flag
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 
 WEIGHT = "weight of the error"

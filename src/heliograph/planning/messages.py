@@ -16,7 +16,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.check import TINY, check_count, fail, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo

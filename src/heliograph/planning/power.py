@@ -15,8 +15,7 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import sent_powers, steady_powers

@@ -8,8 +8,7 @@ import numpy as np
 
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.check import fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, as_budget
 from heliograph.planning.error import Error

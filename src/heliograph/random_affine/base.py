@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import fail, items, shown
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, stacked
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.moments.moments import Moments

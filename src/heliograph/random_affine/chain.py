@@ -13,10 +13,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
-from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
-from heliograph.numerics.domain import PROBABILITY, SIMPLEX, tell
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.check import (
+    PROBABILITY,
+    PROBABILITY_TOLERANCE,
+    SIMPLEX,
+    array,
+    check_count,
+    fail,
+    probabilities,
+    radii,
+    scalar,
+    tell,
+)
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike
 

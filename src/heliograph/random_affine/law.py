@@ -17,8 +17,7 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics import check
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, radii, scalar
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike
 

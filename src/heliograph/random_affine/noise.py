@@ -13,8 +13,7 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, shown
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.moments.monomials import Exponents, exponents

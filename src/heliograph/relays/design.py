@@ -5,12 +5,11 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
-from heliograph.linear.schedule import Gains, Schedule
+from heliograph.linear.system import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import Propagated, initial_moments, propagate, propagate_own, step_moments
 

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.linear.recursion import lmmse
-from heliograph.linear.schedule import Schedule
-from heliograph.linear.system import LinearSystem
+from heliograph.linear.system import LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.innovation_summary import InnovationSummary, outlying, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
 from heliograph.model.estimate import Innovation
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from heliograph.disk.output_file import check_replaceable, whole_folder
+from heliograph.disk.whole_file import check_replaceable, whole_folder
 from heliograph.report.progress import Advance, progress
 
 if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line

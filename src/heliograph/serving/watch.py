@@ -15,7 +15,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
 from heliograph.live.player import TIME_STEP
 from heliograph.model.estimate import Claim
-from heliograph.numerics.unit import unit_of
+from heliograph.numerics.types import unit_of
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output

@@ -6,22 +6,24 @@ from typing import Literal, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from heliograph.linear.arrival import plant_matrices, sensor_matrices
 from heliograph.linear.known_losses import (
     BELOW_ONE,
     KindGains,
     KnownLossSystem,
+    Unseen,
     certified_radius,
+    fastest_unseen,
     find_gains,
     long_run_law,
+    reached,
     spectral_radius,
     steady,
 )
-from heliograph.linear.unseen import Unseen, fastest_unseen, reached
+from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain

@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
-from heliograph.linear.schedule import Schedule
+from heliograph.linear.system import Schedule
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim
@@ -21,8 +21,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_horizon, fail, table
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim

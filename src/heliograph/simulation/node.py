@@ -15,8 +15,7 @@ from heliograph.model.over_time import alike, first
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.check import fail, shown, table
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.flags import check_flags

@@ -11,9 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import computed
 from heliograph.numerics.check import array, check_times, fail, instance, table
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.forked import check_process
+from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports

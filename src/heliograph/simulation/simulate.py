@@ -12,8 +12,7 @@ from jaxtyping import PyTree
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.forked import check_process
+from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, key_of

@@ -28,8 +28,7 @@ from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
 from heliograph.simulation.runs.by_run import each_run
 from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.consistency import nis_sums, warn_of
-from heliograph.smoothing.modes import AbstractSmoothing
+from heliograph.smoothing.modes import AbstractSmoothing, nis_sums, warn_of
 
 
 class Smoother(Module):

@@ -18,8 +18,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail, instance, text
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.centres.centre import (

@@ -6,7 +6,7 @@ from .modes import (
     FixedLag as FixedLag,
     FixedPoint as FixedPoint,
 )
-from .planned import (
+from .rts import (
     PlannedSmoother as PlannedSmoother,
     planned_smoother as planned_smoother,
 )

@@ -1,5 +1,7 @@
 """Smoothing modes: fixed interval, fixed lag and fixed point."""
 
+import warnings
+from itertools import pairwise
 from typing import TypeVar
 
 import equinox as eqx
@@ -10,11 +12,47 @@ import numpy as np
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.float64 import compiled
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.types import Array, Float
 from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag
-from heliograph.smoothing.consistency import nis_sums, warn_of
+
+BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
+DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
+EXCESS = 1.05  # times the expected NIS: less does little harm
+
+
+@in_float64
+def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
+    """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
+    if steps.nis is None or steps.received is None:
+        return jnp.zeros(5)
+    time = len(steps.mean)
+    count = min(BLOCKS, time)
+    edges = [-(-time * i // count) for i in range(count + 1)]
+    s, h = (jnp.stack([jnp.sum(part[a:b]) for a, b in pairwise(edges)]) for part in (steps.nis, steps.received))
+    return jnp.stack([jnp.sum(part) for part in (s, h, s * s, s * h, h * h)])
+
+
+def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
+    """Mean NIS per component, 1 for a consistent filter, and its standard error from the scatter of the blocks."""
+    s, h, ss, sh, hh = (float(part) for part in sums)
+    if not h:
+        return 1.0, 0.0
+    ratio = s / h
+    return ratio, float(np.sqrt(max(ss - 2 * ratio * sh + ratio**2 * hh, 0.0))) / h
+
+
+def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
+    """Warn if a filter's NIS is significantly larger than its model predicts."""
+    ratio, error = nis_test(sums)
+    if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
+        warnings.warn(
+            f"{name}: squared innovations are {ratio:.3g} +- {error:.1g} times what the filter believes; of a filter "
+            "that is not consistent later data make the claims worse, and perhaps the estimates",
+            stacklevel=3,
+        )
+
 
 A = TypeVar("A", jax.Array, np.ndarray)
 

@@ -9,19 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
-from heliograph.filters.linear.centre import Centre
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.linear.open_loop import OpenLoop
-from heliograph.filters.linear.polynomial import PolynomialFilter
+from heliograph.filters.linear.polynomial import Centre, PolynomialFilter
 from heliograph.filters.linear.scheduled import LinearSystemFilter
 from heliograph.filters.modes.mixture import Components, MixtureFilter
 from heliograph.filters.modes.modal import ModalFilter, ObservationModel
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformation, SideInformationFilter
 from heliograph.filters.modes.uncertain import UncertainModalFilter
-from heliograph.filters.wrappers.prediction import PredictionFilter
+from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime, first, over_time, unstack

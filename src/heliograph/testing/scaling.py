@@ -8,7 +8,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.sequential import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.wrappers.prediction import PredictionFilter
+from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.fusion.informed import ScalarWeights
 from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
 from heliograph.model.channel import Channel

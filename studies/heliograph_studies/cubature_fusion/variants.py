@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
-from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.wrappers.prediction import prediction_of
+from heliograph.filters.wrappers.fed_back import prediction_of
 from heliograph_studies.h_infinity_fusion import structured
 from heliograph_studies.h_infinity_fusion.example import Mean, mean_and_error
 from heliograph_studies.h_infinity_fusion.levels import without_gain

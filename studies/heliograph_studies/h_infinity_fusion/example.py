@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.wrappers.prediction import prediction_of
+from heliograph.filters.wrappers.fed_back import prediction_of
 from heliograph.fusion.quantizer import Quantizer
 from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting
 from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 import heliograph as hg
-from heliograph.filters.wrappers.prediction import Ahead
+from heliograph.filters.wrappers.fed_back import Ahead
 from heliograph.numerics.module import Module
 
 SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken

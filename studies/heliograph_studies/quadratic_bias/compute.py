@@ -11,10 +11,9 @@ import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
 from heliograph.filters.linear.polynomial import MemoryFilter
 from heliograph.linear import lifted_system
-from heliograph.linear.comparison import skewness
-from heliograph.linear.memory import memory_system
+from heliograph.linear.polynomial import memory_system, skewness
 from heliograph.linear.recursion import lmmse
-from heliograph.linear.schedule import Schedule
+from heliograph.linear.system import Schedule
 from heliograph.model.over_time import first
 from heliograph.simulation import ErrorStatistics
 from heliograph_studies.outcome import Inline, Unlisted

@@ -6,8 +6,7 @@ import numpy as np
 
 from heliograph.linear.lift import lifted_system
 from heliograph.linear.recursion import lmmse, true_covariance
-from heliograph.linear.schedule import Schedule
-from heliograph.linear.system import LinearSystem, state_moments
+from heliograph.linear.system import LinearSystem, Schedule, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from heliograph.filters.innovation_summary import InnovationSummary, outlying, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
 from heliograph.model.estimate import Innovation
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages

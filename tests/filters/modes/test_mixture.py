@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.filters.modes.combinations import atoms_of
+from heliograph.filters.modes.mixture import atoms_of
 from tests.follow import follow
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model

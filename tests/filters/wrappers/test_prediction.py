@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.wrappers.prediction import prediction_of
+from heliograph.filters.wrappers.fed_back import prediction_of
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1 * np.eye(2), [1.0, -1.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.5)

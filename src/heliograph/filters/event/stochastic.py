@@ -12,10 +12,10 @@ from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, togethe
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import signal_of
-from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
-from heliograph.filters.modes.mode_observations import receive
+from heliograph.filters.modes.multiple_model import receive
 from heliograph.filters.modes.side_information import SideInformation, with_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import moments_smoother_step

@@ -28,8 +28,8 @@ from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import diagonal, diagonal_of
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, diagonal_of
 from heliograph.numerics.types import ArrayLike
 
 ITERATIONS = 5

@@ -14,10 +14,7 @@ import numpy as np
 from heliograph.filters.gaussian.precise import precise_update
 from heliograph.filters.gaussian.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail, instance
-from heliograph.numerics.module import Module
-from heliograph.numerics.over_runs import Pick, runs_last, runs_last_of, where_any, where_each
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import (
+from heliograph.numerics.linalg import (
     PRECISE,
     congruence,
     diagonal,
@@ -33,6 +30,8 @@ from heliograph.numerics.small_matrix import (
     transpose,
     with_rounding,
 )
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.over_runs import Pick, runs_last, runs_last_of, where_any, where_each
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -18,16 +18,16 @@ from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link, mean_gain
+from heliograph.model.channel import Channel, check_link, mean_gain, perfect
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, continued, nearest
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
@@ -309,3 +309,36 @@ def mean_gain_filter(
     """
     believed = mean_gain(without_memory(channel))
     return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)
+
+
+MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
+
+
+def kalman_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
+) -> GaussianFilter:
+    """Kalman filter of a linear plant whose linear sensor is received directly.
+
+    P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
+
+    Args:
+        plant: a linear plant, n states.
+        sensor: a linear sensor, m outputs.
+        initial_mean: mean (n,) of the first state; the plant's by default.
+        initial_covariance: its covariance (n, n); the plant's by default.
+
+    Claim: "exact" from the plant's initial law, whatever the laws' shapes; "nominal" from another, and with angles.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, parts that do not fit, an initial covariance that is none.
+
+    Source: Kalman, A new approach to linear filtering and prediction problems (1960).
+    """
+    if not is_linear(plant, sensor):
+        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
+        raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
+    channel = perfect(len(first(sensor).outputs))
+    return gaussian_filter(plant, sensor, channel, Linearization(), None, initial_mean, initial_covariance)

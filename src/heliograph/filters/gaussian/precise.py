@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.small_matrix import (
+from heliograph.numerics.linalg import (
     PIVOT_TOLERANCE,
+    PRECISE,
     diagonal,
     diagonal_of,
     identity,
@@ -24,6 +25,8 @@ from heliograph.numerics.small_matrix import (
     transpose,
     uncorrelated,
 )
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.types import Array, Float
 
 LEFT = 100  # times its rounding: a variance below has lost its digits
 
@@ -135,3 +138,27 @@ def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
     rounded = rounded - step[:, None] * g[None]
     whole = whole + step[:, None] * (item.number - times_vector(transpose(whole), item.row))[None]
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
+
+
+def initial_size(mean: Array, covariance: Array) -> Float[jax.Array, " n"]:
+    """E[x_i^2] before the first step, (n,)."""
+    mean = jnp.asarray(mean)
+    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(covariance))
+    return seconds
+
+
+@runs_last
+def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array) -> jax.Array:
+    """P and, of each variance of which a precise measurement left next to nothing, what the mean cannot say.
+
+    That is ((n + 2) eps)^2 E[x_i^2] of the state at the start, and no more than there was. Noise-free data would else
+    shrink P by eps^2 a step, to where a smoother divides the rounding of an innovation by it. A moment from before all
+    data at a later step will not do in place of that at the start: of an unstable plant that its inputs hold it grows
+    without end; nor will the mean, on which no covariance of a linear filter depends.
+
+    Shapes: after and prior (n, n), size (n,).
+    """
+    unit = (len(after) + 2) * float(np.finfo(after.dtype).eps)
+    left, whole = diagonal_of(after), diagonal_of(prior)
+    precise = left < rounding(PRECISE, after, 1000) * whole
+    return after + diagonal(jnp.where(precise, jnp.minimum(unit**2 * size, whole), 0.0))

@@ -24,8 +24,8 @@ from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.linalg import congruence, diagonal, times
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, diagonal, times
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.moments.second_moments import SecondOrder

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.small_matrix import inner, rounding, solver, times, trace, transpose
+from heliograph.numerics.linalg import inner, rounding, solver, times, trace, transpose
 from heliograph.numerics.types import Array
 
 START = 0.1

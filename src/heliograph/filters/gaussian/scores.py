@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, gain_and_covariance
-from heliograph.numerics.module import Module
+from heliograph.numerics.linalg import add, diagonal_of, solve, summed, times, transpose, with_rounding
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import add, diagonal_of, solve, summed, times, transpose, with_rounding
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
 SMALLEST = 1e-200  # weight: below, a component counts as missing

@@ -10,11 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.module import Module
+from heliograph.numerics.linalg import add, cholesky, symmetric, times, transpose
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import add, symmetric, times, transpose
 from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number

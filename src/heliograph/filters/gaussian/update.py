@@ -19,8 +19,7 @@ from heliograph.filters.gaussian.correction import (
     zero_mean_correction,
 )
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import describe
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
@@ -30,8 +30,8 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import congruence, times, times_vector, transpose
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean

@@ -15,8 +15,8 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 

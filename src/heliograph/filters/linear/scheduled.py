@@ -15,8 +15,7 @@ from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.linear.recursion import RANK_TOLERANCE
-from heliograph.linear.schedule import Gains, Schedule
-from heliograph.linear.system import LinearSystem, Steps
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names

@@ -15,7 +15,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.rounding import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, within_range

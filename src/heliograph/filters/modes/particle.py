@@ -9,10 +9,9 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
-from heliograph.filters.gaussian.rounding import initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.mode_observations import receive
-from heliograph.filters.modes.multiple_model import link_by_mode, merged, together
+from heliograph.filters.modes.multiple_model import link_by_mode, merged, receive, together
 from heliograph.filters.modes.side_information import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation

@@ -8,12 +8,17 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.plausibility import innovation_distance
-from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point, applied, less
-from heliograph.filters.smoother_step.linear import LinearSmootherStep
+from heliograph.filters.smoother_step.base import (
+    AbstractSmootherStep,
+    LinearSmootherStep,
+    Moments,
+    Point,
+    applied,
+    less,
+)
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import (
+from heliograph.numerics.linalg import (
     PRECISE,
     congruence,
     diagonal,
@@ -24,7 +29,8 @@ from heliograph.numerics.small_matrix import (
     times,
     transpose,
 )
-from heliograph.numerics.small_matrix import solve as small_solve
+from heliograph.numerics.linalg import solve as small_solve
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Float
 
 

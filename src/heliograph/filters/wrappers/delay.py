@@ -1,6 +1,7 @@
-"""Filters behind delayed links: constant delays, delays known at the receiver, and lines of past signals."""
+"""Filters behind delayed links, and parts of filters of larger systems, whose states are past signals too."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,24 +10,212 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.correction import homogeneous
+from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
-from heliograph.filters.wrappers.held import HeldFilter, relayed_filter, with_relays
-from heliograph.filters.wrappers.part import AbstractPartFilter, PartFilter
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
 from heliograph.model.past import with_past
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import ArrayLike, Float, Int, PyTree
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.delay import Delayed, of_line, sent
 from heliograph.random_affine.in_line import Relayed
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.noise import Gaussian, Independent
+
+
+class AbstractPartFilter(AbstractSizedFilter):
+    """Filter that estimates the first states of those of `base`, which it predicts and corrects."""
+
+    base: eqx.AbstractVar[AbstractFilter]
+
+    @in_float64
+    def init(self) -> PyTree:
+        """Return the larger filter's initial state."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Predict with the larger filter."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct with the larger filter."""
+        return self.base.correct(state, z, k)
+
+    @in_float64
+    def estimate(self, state: PyTree) -> Estimate:
+        """Mean and covariance of the first states."""
+        return self._part(self.base.estimate(state))
+
+    def _part(self, whole: Estimate) -> Estimate:
+        n = len(self.states)
+        return Estimate(whole.mean[..., :n], whole.covariance[..., :n, :n], self.claim)
+
+
+class PartFilter(AbstractPartFilter):
+    """A filter of a larger system that estimates its first states alone. Built by `part_filter`."""
+
+    base: AbstractFilter
+
+    def __init__(self, base: AbstractFilter, states: int):
+        self.base, self.claim, self.states = base, base.claim, base.states[:states]
+        self.inputs, self.received = base.inputs, base.received
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """Mean and covariance of the first states after step k."""
+        return self._part(self.base.after_step(state, k))
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """Precompute all that does not depend on data."""
+        plan, n = self.base.planned(inputs), len(self.states)
+        if not isinstance(plan, PlannedFilter):
+            return PartFilter(plan, n)
+        projection = jnp.eye(len(self.base.states)) if plan.projection is None else jnp.asarray(plan.projection)
+        return replace(plan, covariances=plan.covariances[:, :n, :n], projection=projection[:n], states=self.states)
+
+
+def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
+    """Restrict a filter to its first states, as those of the plant in a system enlarged by `with_past`.
+
+    Args:
+        filter: the filter of the larger system.
+        states: how many of its states are estimated, counted from the first.
+
+    Claim: that of `filter`.
+
+    Raises:
+        ValueError: no filter, more states than it has.
+
+    Source: a part of a linear estimate is the estimate of that part.
+    """
+    instance("filter", filter, AbstractFilter, "a filter")
+    if check_count("states", states) > len(filter.states):
+        raise fail("states", f"at most the filter's {len(filter.states)}", states)
+    return PartFilter(filter, states)
+
+
+class HeldFilter(AbstractPartFilter):
+    """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
+
+    Each line of past signals is as long as its values may still be received. At each step relay i receives r = G l + n
+    of the line l of the stage before, whatever is forwarded later: its mean is M l + b, and Cov(r | l) is taken at the
+    unconditional moments of l.
+
+    base: the filter of these states, whose plant shifts all lines by one and leaves their first places empty.
+    links: the relays' links. lines: for each relay the line that it receives and the place of its received signal, as
+    (start, length, place).
+    """
+
+    base: AbstractFilter
+    links: tuple[SecondOrder, ...]
+    lines: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Move the plant, send the sensor's signal, and receive it at one relay after another."""
+        state = self.base.predict(state, u, k)
+        for link, line in zip(self.links, self.lines, strict=True):
+            state = _received_by(state, link, *line)
+        return state
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """Precompute all covariances and gains."""
+        return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
+
+
+def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
+    """Moments after r = G l + n stands at `place`, l the line of `length` from `start` on."""
+    # x+ = move x + shift: the received signal replaces what stands at its place.
+    gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
+    total, m = len(state.mean), len(offset)
+    here, there = slice(start, start + length), slice(place, place + m)
+    move, shift = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain), jnp.zeros(total).at[there].set(offset)
+    # Cov(r | l) at the unconditional moments of l.
+    mean, covariance = state.state_mean[here], state.state_covariance[here, here]
+    second = homogeneous(covariance + jnp.outer(mean, mean), mean, 1.0)
+    fresh = jnp.zeros((total, total)).at[there, there].set(link.spread.middle(second, jnp.ones(m, dtype=bool)))
+    return state._replace(
+        mean=move @ state.mean + shift,
+        covariance=symmetrize(move @ state.covariance @ move.T + fresh),
+        state_mean=move @ state.state_mean + shift,
+        state_covariance=symmetrize(move @ state.state_covariance @ move.T + fresh),
+    )
+
+
+def with_relays(
+    plant: AnyPlant, sensor: AnySensor, channel: Relayed
+) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
+    """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, links with memory.
+    """
+    for stage in channel.stages:
+        check_forgets("link of a relay that is late by chance", stage)
+    # The sensor's line, then one line per relay behind it.
+    moved, _, _ = with_past(plant, sensor, channel.stages[0])
+    start, lines = len(first(plant).states), []
+    total = len(first(moved).states)
+    for i, (stage, later) in enumerate(zip(channel.stages, channel.stages[1:], strict=False)):
+        lines.append((start, stage.inputs, total))
+        start = total
+        total += later.inputs
+        if isinstance(moved, OverTime):
+            moved = over_time([_holding(item, i, stage.outputs, later.past) for item in unstack(moved)])
+        else:
+            moved = _holding(moved, i, stage.outputs, later.past)
+    # The receiver sees the line of the last relay.
+    last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
+    return moved, last, of_line(channel.stages[-1]), tuple(lines)
+
+
+def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
+    """Enlarge the plant by the line of a relay, which shifts by one at each step."""
+    held, n = size * (1 + steps), len(plant.states)
+    xp, none = library(plant.matrix, plant.input_matrix), Gaussian(np.zeros((held, held)))
+    shift = np.kron(np.eye(1 + steps, k=-1), np.eye(size))
+    return LinearPlant(
+        xp.block([[plant.matrix, np.zeros((n, held))], [np.zeros((held, n)), shift]]),
+        Independent([plant.noise, none]),
+        xp.concatenate([plant.initial_mean - plant.deviation.mean, np.zeros(held)]),
+        Independent([plant.deviation, none]),
+        xp.concatenate([plant.input_matrix, np.zeros((held, len(plant.inputs)))]),
+        (*plant.states, *(f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size))),
+        plant.inputs,
+    )
+
+
+def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
+    """Build the filter behind relays from `base`, the filter of all lines.
+
+    Raises:
+        ValueError: relays' links with uncertain probabilities.
+    """
+    # Only the moments under known probabilities make the filter optimal.
+    links = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
+    if any(link.uncertain for link in links):
+        raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
+    start = first(plant)
+    return HeldFilter(
+        base=base,
+        links=links,
+        lines=lines,
+        claim=base.claim,
+        states=start.states,
+        inputs=start.inputs,
+        received=channel.outputs,
+    )
 
 
 class LateState(NamedTuple):

@@ -16,9 +16,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import add, identity, root, solve, symmetric, symmetrize, times, transpose
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import add, identity, root, solve, symmetric, times, transpose
 from heliograph.numerics.types import Array, Bool, Float
 
 

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.intersection import inverse
-from heliograph.numerics.linalg import regular_solve
+from heliograph.numerics.linalg import add, diagonal_of, factor, identity, minus, regular_solve, symmetric
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import add, diagonal_of, factor, identity, minus, symmetric
 from heliograph.numerics.types import Bool, Float
 
 SHORT = 24  # unknowns of equations that are solved side by side, operation by operation

@@ -22,10 +22,9 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.same import same
-from heliograph.numerics.small_matrix import solve
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.linalg import solve
+from heliograph.numerics.module import same
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.erasure import arrived

@@ -9,7 +9,7 @@ from scipy.special import logsumexp, ndtr
 from scipy.stats import kstest
 
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter, signal_of
-from heliograph.filters.modes.combinations import Component, atoms_of
+from heliograph.filters.modes.mixture import Component, atoms_of
 from heliograph.filters.rows import rows
 from heliograph.learning.likelihood.law_nodes import with_nodes
 from heliograph.model.over_time import at
@@ -18,7 +18,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Stack

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.linear.linear import LinearBelief, LinearFilter
 from heliograph.filters.linear.plan import Plan, followed
-from heliograph.numerics.small_matrix import times
+from heliograph.numerics.linalg import times
 from heliograph.numerics.types import Array, Float, PyTree
 
 PART = 1 / 20  # of all steps, within which gains have to become constant, or nothing is gained

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import fail
-from heliograph.numerics.domain import Domain
+from heliograph.numerics.check import Domain, fail
 from heliograph.numerics.types import Array, Float, PyTree
 
 

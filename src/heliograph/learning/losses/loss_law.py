@@ -8,8 +8,7 @@ from heliograph.learning.losses.stretches import as_fates
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine

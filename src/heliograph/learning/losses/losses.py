@@ -15,7 +15,7 @@ from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLoss
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
 from heliograph.learning.losses.stretches import Fates, as_fates
 from heliograph.numerics.check import fail, scalar, table
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
 INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"

@@ -16,7 +16,7 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.same import same
+from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float
 from heliograph.planning.descent import Evaluation, Problem
 from heliograph.planning.error import Criterion, Error

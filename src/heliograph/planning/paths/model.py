@@ -14,7 +14,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
 from heliograph.planning.moments import moments_over, steady_moment

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from heliograph.numerics.caching import cached
+from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets

@@ -12,9 +12,8 @@ from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import factored_weights, matrix_weights
 from heliograph.numerics.check import array, check_horizon, fail, instance
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.centres.centre import Together
 from heliograph.simulation.network import Network

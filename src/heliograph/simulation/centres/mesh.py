@@ -17,10 +17,9 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, transpose
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, solve, times, transpose
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import ObservationModel, observation_model
 from heliograph.simulation.centres.edges import Edges, edges_of

@@ -13,9 +13,8 @@ from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of, transitions

@@ -21,8 +21,7 @@ from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.edges import arrival_chance

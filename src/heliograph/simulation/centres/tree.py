@@ -17,9 +17,8 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, fail, function, instance
-from heliograph.numerics.compiler import quickly_compiled
-from heliograph.numerics.float64 import to_numpy
-from heliograph.numerics.readable import readable
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
 from heliograph.simulation.network import FUSED, Network

@@ -15,8 +15,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.over_time import OverTime, at, over_time, stack, structure
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.simulation.centres.centre import described

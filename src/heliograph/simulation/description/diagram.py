@@ -8,7 +8,7 @@ from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import first
 from heliograph.model.relays import RelayNetwork
-from heliograph.numerics.readable import LINES, cut
+from heliograph.numerics.module import LINES, cut
 from heliograph.random_affine.base import memories
 from heliograph.simulation.description.links import ARROW, link_in_words
 from heliograph.simulation.node import Node

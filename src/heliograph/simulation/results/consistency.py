@@ -8,8 +8,8 @@ from scipy import stats
 
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import squared_distance
+from heliograph.numerics.linalg import squared_distance
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 DIMENSION_WORDS = "the degrees of freedom: a positive number, or one of each value"

@@ -10,8 +10,8 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.readable import readable
-from heliograph.numerics.unit import units_in
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees

@@ -11,8 +11,7 @@ from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
-from heliograph.numerics.module import Module
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import Module, readable
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
     by_name,

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from heliograph.disk.output_file import check_output, check_replaceable, whole_folder
 from heliograph.disk.quoting import from_file, in_file
-from heliograph.disk.whole_file import whole_file
+from heliograph.disk.whole_file import check_output, check_replaceable, whole_file, whole_folder
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.results.labelled import checked_units
 

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance, items
-from heliograph.numerics.readable import readable
+from heliograph.numerics.module import readable
 from heliograph.simulation.centres.uplinks import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error

@@ -8,8 +8,8 @@ import numpy as np
 
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
-from heliograph.numerics.readable import readable
-from heliograph.numerics.unit import units_in
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import units_in
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.labelled import (
     TIME,

@@ -14,8 +14,8 @@ from jaxtyping import PyTree
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import squared_distance
 from heliograph.numerics.types import Array
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network

@@ -13,8 +13,8 @@ from heliograph.filters.rows import data_of, over_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.readable import readable
-from heliograph.numerics.small_matrix import whiten
+from heliograph.numerics.linalg import whiten
+from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 

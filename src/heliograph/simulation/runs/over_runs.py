@@ -9,8 +9,7 @@ import numpy as np
 
 from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_count, fail, shown
-from heliograph.numerics.compiler import fully_optimised
-from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.float64 import fully_optimised, to_numpy
 from heliograph.numerics.types import PyTree
 
 WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache
