@@ -39,7 +39,7 @@ class Flat(NamedTuple):
         parts, begin = [], 0
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             end = begin + int(np.prod(shape))
-            parts.append(rows[..., begin:end].reshape(*rows.shape[:-1], *shape).astype(kind))
+            parts.append(rows[..., begin:end].reshape((*rows.shape[:-1], *shape)).astype(kind))
             begin = end
         return self.structure.unflatten(parts)
 
