@@ -125,7 +125,8 @@ class RowStep:
         numbers, static = cast(NetworkStep(network, filters))
         data = numbers, start, np.zeros(received), np.zeros(inputs), np.asarray(0)
         like = jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], *data)
-        self.state, self.outputs, self.start = flat_like(start), flat_like(like), np.asarray(row_of(start))
+        self.state, self.outputs = flat_like(start), flat_like(like)
+        self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         self._layout = Layout(static, self.state, self.outputs, received, inputs)
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
