@@ -37,7 +37,11 @@ class Choice(NamedTuple):
     @property
     def explained(self) -> str:
         """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
-        return f"xla: {self.why}" if self.code is None else f"native: {self.code.code.operations} operations"
+        if self.code is None:
+            return f"xla: {self.why}"
+        code = self.code.code
+        slow = f", {code.divisions} of them divisions and roots" if code.divisions else ""
+        return f"native: {code.operations} operations{slow}"
 
     def results(self) -> PyTree:
         """Run the code on the arrays."""
