@@ -207,7 +207,7 @@ def test_one_line_that_names_it(make, name, came):
     assert came in "got " + message.split(", got ", 1)[1]
 
 
-def test_a_covariance_that_is_lost_is_flagged_and_kept():
+def test_a_covariance_that_is_lost_is_flagged_and_stays():
     net = h.Network(plant(), {"a": h.Node(sensor(), h.perfect(), {"losing": Losing()})})
     record = h.run(net, {"a": np.zeros(4)})
     assert record.failures() == ["a/losing: no valid covariance from step 2 in 1 of 1 runs"]

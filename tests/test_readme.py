@@ -119,7 +119,7 @@ def against_peers() -> dict[str, list[str]]:
     return {name: cells for name, *cells in rows}
 
 
-def test_every_row_beside_peers_names_a_command_that_there_is():
+def test_every_row_of_peers_names_a_command_that_there_is():
     """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
     rows = against_peers()
     assert len(rows) == 12

@@ -108,7 +108,7 @@ def test_the_summary_counts_what_is_wrong(soak: ModuleType) -> None:
     assert result["limit in standard errors"] == pytest.approx(5.1, abs=0.2)
 
 
-def test_the_last_soak_tried_all_and_found_every_promise_kept(soak: ModuleType) -> None:
+def test_the_last_soak_tried_all_and_every_promise_held(soak: ModuleType) -> None:
     """What benchmarks/soak.json says, which docs/theory.md tells."""
     content = json.loads(soak.RESULTS.read_text())
     assert (content["networks"], content["seed"], content["runs"]) == (soak.COUNT, soak.SEED, soak.RUNS)

@@ -35,7 +35,7 @@ from .model.sensor import (
     LinearSensor as LinearSensor,
     Sensor as Sensor,
 )
-from .model.state_space import (
+from .model.sensor import (
     state_space as state_space,
 )
 from .model.channel import (

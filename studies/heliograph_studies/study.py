@@ -108,12 +108,12 @@ class Study(Generic[Setting, Outcome]):
             stages.advance = advance
             return self.compute(chosen, stages)
 
-        def tell(outcome: Outcome) -> Results:
+        def results_of(outcome: Outcome) -> Results:
             stages.stage = "drawing and writing"
             return self._results(chosen, outcome, lines)
 
         with stages.failing_in_a_line():
-            outcome = write_results(target, self.stages, work, tell, self.needs)
+            outcome = write_results(target, self.stages, work, results_of, self.needs)
         stages.clear()
         print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome

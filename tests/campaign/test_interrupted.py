@@ -91,7 +91,7 @@ def test_a_cluster_whose_worker_is_killed(tmp_path, expected, monkeypatch):
                 killed.append(pids[0])
                 os.kill(pids[0], signal.SIGKILL)
 
-        result = run_campaign(write(tmp_path), tmp_path / "out", scheduler=cluster.scheduler_address, tell=kill_one)
+        result = run_campaign(write(tmp_path), tmp_path / "out", scheduler=cluster.scheduler_address, progress=kill_one)
     assert killed and (result.computed, result.failures) == (CHUNKS, [])
     assert contents(tmp_path / "out") == expected
     assert open_results(tmp_path / "out").error.notnull().all()

@@ -212,7 +212,7 @@ def test_a_scheduler_that_dies_is_one_line_and_the_next_run_goes_on(tmp_path, ex
                 cluster.sync(cluster.scheduler.close)
 
         with pytest.raises(ValueError, match="scheduler: expected one that goes on to the end, got a lost connection"):
-            run_campaign(campaign, out, scheduler=cluster.scheduler_address, tell=end)
+            run_campaign(campaign, out, scheduler=cluster.scheduler_address, progress=end)
     monkeypatch.delenv("PAUSE")
     result = run_campaign(campaign, out, workers=0)
     assert result.already >= 2 and contents(out) == expected
@@ -249,7 +249,7 @@ def test_leftovers_of_killed_processes_go_with_the_next_run(tmp_path, expected):
 NAMES = NETWORK.replace('"near"', 'r"[/red]$\\bad{$"').replace('"trusting"', "\"=cmd|' /C calc'!A0\\x1b[31m\"")
 
 
-def test_names_end_no_campaign_and_act_nowhere(tmp_path, capsys, monkeypatch):
+def test_names_end_no_campaign_and_act_in_no_page(tmp_path, capsys, monkeypatch):
     write(tmp_path, CAMPAIGN.replace("[0.5, 0.7, 0.9]", '[0.5, 0.9]\nkind = ["@one"]'), NAMES)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["sweep", "campaign.toml", "--out", "out", "--workers", "0"]) == 0

@@ -56,14 +56,14 @@ def raised_as_something_else():
         raise RuntimeError("INTERNAL: KeyboardInterrupt") from None
 
 
-def kept_quiet():
+def swallowing():
     try:
         signal.raise_signal(signal.SIGINT)
     except KeyboardInterrupt:
         return
 
 
-@pytest.mark.parametrize("interrupt", [in_a_callback, raised_as_something_else, kept_quiet])
+@pytest.mark.parametrize("interrupt", [in_a_callback, raised_as_something_else, swallowing])
 def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
     stub_study(monkeypatch, lambda *_: interrupt())
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)

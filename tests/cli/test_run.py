@@ -49,6 +49,31 @@ def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert "--smooth: expected all, or how many later rows, got 'soon'" in capsys.readouterr().err
 
 
+def test_limits_act_as_in_a_stream(folder, capsys):
+    """Of a table with a fault code and a value beyond the limits the estimates are those of one without them.
+
+    In a timeline and a service: tests/live/test_implausible.py, tests/serving/test_implausible.py.
+    """
+    bounded = NETWORK.replace("sensor, link, filters)", "sensor, link, filters, limits=(-5, 5), invalid=-999)")
+    (folder / "net.py").write_text(bounded)
+    (folder / "data.csv").write_text("time,push,pos\n0,0,0.5\n0.5,1,-999\n0.5,0,0.7\n2,0.5,6\n2.5,0,0.2\n")
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "node 'remote': 2 of 5 values count as not arrived" in said
+    assert "row 2: pos -999 is a code" in said
+    table, net = read_table("out.csv"), load_network("net.py")
+    item = net.nodes["remote"].filters["aware"]
+    recording = read_recording("data.csv", net)
+    (folder / "data.csv").write_text("time,push,pos\n0,0,0.5\n0.5,1,\n0.5,0,0.7\n2,0.5,\n2.5,0,0.2\n")
+    assert cli.main(run_arguments(out="clean.csv")) == 0
+    clean = read_table("clean.csv")
+    assert all(np.array_equal(table[name], clean[name], equal_nan=True) for name in clean)
+    stream = h.Stream(item, limits=(-5, 5), invalid=-999)
+    for k, (z, u) in enumerate(zip(recording.measurements["remote"], recording.inputs, strict=True)):
+        mean = stream.push(z, u).mean
+        np.testing.assert_allclose([table["aware.p"][k], table["aware.v"][k]], mean, rtol=1e-12, atol=1e-12)
+
+
 def test_names_do_not_act_on_the_terminal(folder, capsys):
     (folder / "net.py").write_text(NETWORK.replace('"aware"', '"\\x1b[31maware"'))
     assert cli.main(run_arguments()) == 0

@@ -80,7 +80,7 @@ def test_a_sum_of_what_is_used_again():
     np.testing.assert_allclose(folded(sums[0], BATCHES), squares, rtol=1e-14)
 
 
-def test_what_has_arrived_is_never_asked_for():
+def test_what_has_arrived_is_never_requested():
     def filled(x):
         return jnp.where(jnp.isnan(x), 0.0, 2 * x), jnp.where(jnp.isnan(arrived(x)), 0.0, 3 * x)
 

@@ -119,7 +119,7 @@ def test_what_all_runs_share_is_computed_once_and_gives_the_same_bits():
         np.testing.assert_array_equal(a, b)
 
 
-def test_loops_end_for_each_run_at_its_own_turn():
+def test_loops_end_for_each_run_at_its_turn():
     def root(x):
         """Newton's method until nothing changes, and how many turns that took."""
 

@@ -63,7 +63,7 @@ def test_a_full_disk_names_the_folder(tmp_path: Path) -> None:
     assert caught.value.filename == str(tmp_path / "out")
 
 
-def test_only_own_results_are_replaceable(tmp_path: Path) -> None:
+def test_only_earlier_results_are_replaceable(tmp_path: Path) -> None:
     check_replaceable(tmp_path / "new", "mark")
     check_replaceable(tmp_path, "mark")
     (tmp_path / "other").touch()

@@ -72,7 +72,7 @@ def test_a_module_of_a_package(in_folder):
     refused("no_such_package.nets", "ModuleNotFoundError", "no_such_package")
 
 
-def test_a_file_finds_modules_beside_it(in_folder):
+def test_a_file_finds_modules_next_to_it(in_folder):
     folder = in_folder / "elsewhere"
     folder.mkdir()
     (folder / "shared_settings.py").write_text("GAIN = 0.5\n")

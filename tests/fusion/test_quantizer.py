@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.fusion.escape_quantizer import Symbols
-from heliograph.fusion.quantizer import widen
+from heliograph.fusion.quantizer import Symbols, widen
 from heliograph.testing import check_quantizer
 
 ESCAPE = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)

@@ -97,7 +97,7 @@ def test_true_constants_give_a_level_that_is_certified():
     np.testing.assert_allclose(design.level, 0.0328, rtol=2e-3)
 
 
-def test_a_guarantee_is_kept_by_simulation():
+def test_a_guarantee_holds_in_simulation():
     """J1 < 0 over the eight-fold outcomes is the promise: energy ratios of 200 random disturbances."""
     system = node(0, growth=0.5)
     design = hg.h_infinity.horizon_design(system)

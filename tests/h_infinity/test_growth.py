@@ -19,7 +19,7 @@ REFUTED = {
 
 
 @pytest.mark.parametrize("name", REFUTED)
-def test_evidence_of_its_own_refutes(name):
+def test_local_evidence_refutes(name):
     function, constant, text = REFUTED[name]
     result = check_growth(function, constant, [-1.0], [1.0])
     assert result.refuted and not result.proved

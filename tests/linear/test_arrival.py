@@ -42,7 +42,7 @@ def test_one_output_needs_the_product_of_all_unstable_eigenvalues(seed):
     np.testing.assert_allclose(result.lower, 1 - 1.4**-2, atol=1e-12)
 
 
-def test_a_gain_that_is_kept():
+def test_a_gain_that_is_held():
     """(1 - arrival) a^2 + arrival (a - k)^2 = 1."""
     k = -0.70078691  # the Kalman gain where everything arrives
     result = hg.linear.critical_arrival(plant([[-1.25]]), sensor([[1.0]]), gain=[[k]])

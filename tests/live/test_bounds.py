@@ -24,7 +24,7 @@ def network():
     return network_of(drifting())
 
 
-def test_a_push_replays_its_own_row_and_those_after_it(network, monkeypatch):
+def test_a_push_replays_its_row_and_those_after_it(network, monkeypatch):
     timeline, spans = hg.Timeline(network, 100.0), []
     replayed = timeline._replayed
     monkeypatch.setattr(timeline, "_replayed", lambda row, *span: (spans.append(span), replayed(row, *span))[1])

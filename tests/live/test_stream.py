@@ -91,7 +91,7 @@ def test_past_the_end_of_what_varies_it_stops():
     assert stream.steps == 3 and np.all(np.isfinite(last.mean))
 
 
-def test_a_polynomial_filter_goes_on_only_where_it_has_settled():
+def test_a_polynomial_filter_goes_on_only_in_its_steady_state():
     plant, sensor = hg.LinearPlant([[0.7]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.5)
     unsettled = hg.Stream(hg.polynomial_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1), 4))
     for _ in range(4):

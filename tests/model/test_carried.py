@@ -3,7 +3,7 @@
 import pytest
 
 import heliograph as hg
-from heliograph.model.angle import carried
+from heliograph.model.channel import carried
 
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 CLEAN, NOISY, HALF = hg.hop(1.0, 0.1), hg.hop(1.0, 2.0), hg.hop(0.5, 0.1)

@@ -97,7 +97,7 @@ def test_the_error_is_that_of_the_power_that_is_sent(
     np.testing.assert_allclose(result[name]["linear"].claimed(), claims, rtol=1e-9)
 
 
-def test_the_gain_noise_of_one_path_of_many_is_its_own() -> None:
+def test_the_gain_noise_of_one_path_of_many_is_that_of_the_path() -> None:
     """Each number of several with a reference of its own, as each path with its own."""
     together = second_order(centred(hg.parallel([RELAYED, HOPS[0]]), [3.0, -2.0]))
     apart = second_order(hg.parallel([centred(RELAYED, 3.0), centred(HOPS[0], -2.0)]))

@@ -43,7 +43,7 @@ def test_what_others_have_too_cannot_be_written_to() -> None:
         Holder(1.0).power(2)[0] = 5.0
 
 
-def test_what_is_traced_is_not_kept() -> None:
+def test_what_is_traced_is_not_cached() -> None:
     item = Holder(1.0)
     result = jax.jit(lambda x: Holder(x).power(2) + item.power(2))(3.0)
     assert np.asarray(result).tolist() == [4.0, 4.0]
@@ -60,7 +60,7 @@ def test_nothing_keeps_the_object_alive() -> None:
     assert gone() is None
 
 
-def test_what_cannot_be_kept_is_refused_in_its_own_words() -> None:
+def test_what_cannot_be_cached_is_refused_in_words() -> None:
     for item in (3, "text", None, Holder(1.0)):
         with pytest.raises(ValueError, match="no"):
             refusing(item)

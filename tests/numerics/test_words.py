@@ -117,6 +117,7 @@ def test_matrices_in_place_of_a_plant_are_answered_with_the_call_that_takes_them
 @pytest.mark.parametrize(
     ("name", "offered"),
     [
+        ("neess", "closest: nees"),
         ("kalmanfilter", "closest: kalman_filter"),
         ("KalmanFilter", "closest: kalman_filter"),
         ("monte_carl", "closest: monte_carlo"),

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import GainAndNoise
 from heliograph.random_affine.law import AbstractLaw
-from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import Moments
 from heliograph.testing import check_random_affine
 
 COVARIANCE = np.array([[0.2, 0.05], [0.05, 0.1]])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.side_information import outcomes
+from heliograph.random_affine.erasure import outcomes
 
 HALF = hg.erasure(hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.1), 0.5)
 

@@ -9,10 +9,14 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.relays.descent import bfgs
-from heliograph.relays.design import given_design, own_error_design
-from heliograph.relays.periodic import periodic_behind_relays, periodic_given_design, periodic_own_error_design
-from heliograph.relays.periodic_tuning import periodic_receiver_error_design, periodic_relays_for_best_receiver
-from heliograph.relays.receiver import receiver_behind_relays
+from heliograph.relays.design import given_design, own_error_design, receiver_behind_relays
+from heliograph.relays.periodic import (
+    periodic_behind_relays,
+    periodic_given_design,
+    periodic_own_error_design,
+    periodic_receiver_error_design,
+    periodic_relays_for_best_receiver,
+)
 from tests.relays.relay_problems import example, relative
 
 PAPER = 1.066244e-5  # steady sum of even and odd tr P, by the oracle's 4000 steps
@@ -85,7 +89,7 @@ def test_what_has_no_steady_state_is_refused(local):
         periodic_relays_for_best_receiver(alone)
 
 
-def test_descent_finds_the_bottom_of_a_curved_valley_beside_a_cliff():
+def test_descent_finds_the_bottom_of_a_curved_valley_next_to_a_cliff():
     def rosenbrock(x):
         if x[0] > 1.5:
             return np.inf, np.zeros(2)

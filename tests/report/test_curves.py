@@ -28,7 +28,7 @@ def test_marks_stand_where_they_are_named_and_gaps_stay_open():
     assert axes.get_yscale() == "log" and axes.get_xlabel() == "arrival"
 
 
-def test_a_curve_that_ends_early_is_named_at_its_own_end():
+def test_a_curve_that_ends_early_is_named_at_its_end():
     time = np.arange(20.0)
     early = np.where(time < 10, 3.0, np.nan)
     figure = curves_over_time(time, [Panel("a", [Curve("early", BLUE, early), Curve("late", INK, 0 * time)])])

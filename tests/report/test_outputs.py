@@ -41,9 +41,18 @@ def test_the_output_with_outliers_is_to_blame(recorded):
     assert (left.summary.received, right.summary.received) == tuple(arrived.sum(axis=0))
     # Of the 20 rows with 15 more (14 deviations of an innovation) those that arrived, and the law's own 2 %.
     off = arrived[::10, 0].sum()
-    assert off <= left.summary.down_weighted <= off + 9 and left.outlying and not right.outlying
+    assert off <= left.summary.down_weighted <= off + 9 and left.to_blame and not right.to_blame
     assert str(left).startswith(f"tank/robust: left: {left.summary.down_weighted} of {left.summary.received} down-we")
     assert str(left).endswith("; to blame: more than of the others") and "to blame" not in str(right)
+
+
+def test_only_a_filter_that_the_network_relies_on_blames_an_output_where_it_weighs(recorded):
+    """Of two that weigh the network relies on the first; of `FILTERS` on the one that does not weigh."""
+    two = {"robust": FILTERS["robust"], "again": FILTERS["robust"]}
+    network = hg.Network(PLANT, {"tank": hg.Node(SENSOR, LINK, two)})
+    items = weighed_outputs(network, hg.run(network, {"tank": recorded}), np.zeros((STEPS, 0)))
+    assert [(item.filter, item.output) for item in items if item.to_blame] == [("robust", "left")]
+    assert items[0].summary == items[2].summary
 
 
 def test_the_page_and_the_last_lines_have_the_same_numbers(recorded, tmp_path, fits, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """The page of a run: its numbers are those of the recording, and what is wrong is said."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -121,8 +122,8 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     assert cli.main(arguments[:-2]) == 2 and "(--out FILE) or a folder for a report" in capsys.readouterr().err
 
 
-def test_the_fused_estimate_comes_first_and_what_is_not_drawn_is_named(fits):
-    """Ten nodes and a centre: eight are drawn, the centre first, and the others are named."""
+def test_of_many_nodes_one_is_chosen_from_a_list_the_fused_estimate_first(fits):
+    """Ten nodes and a centre: every estimate and every filter's innovations are there, one shown at a time."""
     sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["height"])
     nodes = {f"n{i}": hg.Node(sensor, hg.perfect(), {"kalman": hg.kalman_filter(PLANT, sensor)}) for i in range(10)}
     network = hg.Network(PLANT, nodes, {"all": hg.Fusion("kalman", hg.CovarianceIntersection())})
@@ -130,13 +131,19 @@ def test_the_fused_estimate_comes_first_and_what_is_not_drawn_is_named(fits):
     record = hg.run(network, dict(zip(nodes, received, strict=True)))
     health_ = examine(network, record, np.zeros((60, 0)))
     figures = run_figures(health_)
+    assert list(figures) == [f"estimates_{i}" for i in range(11)] + [f"innovations_{i}" for i in range(10)] + ["links"]
     page = run_page(health_, "net", dict.fromkeys(figures, b"<svg/>")).html()
     fits(page)
+    options = re.findall("<option>(.*?)</option>", page)
+    assert options == ["fused", *nodes, *nodes] and page.count("<select") == 2 and "Not drawn" not in page
     assert page.index("fused: estimates with bands") < page.index("n0: estimates with bands")
-    assert "Not drawn, for lack of room: n7, n8, n9." in page
-    assert "Not drawn, for lack of room: n8/kalman, n9/kalman." in page
-    legend = figures["innovations"].axes[0].get_legend()
+    legend = figures["innovations_0"].axes[0].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["height"]
+
+
+def test_few_nodes_stand_below_each_other(health):
+    page = run_page(health, "net", dict.fromkeys(run_figures(health), b"<svg/>")).html()
+    assert "<select" not in page and "<script" not in page
 
 
 CENTRAL = """
@@ -189,7 +196,7 @@ def test_a_doubt_names_its_filter(health):
     assert title.endswith(" about the network: a/sure")
 
 
-def test_numbers_are_rounded_by_their_own_error():
+def test_numbers_are_rounded_by_their_standard_error():
     """Two digits of the standard error, whatever the size of the number."""
     for value, error, text in [
         (12.34567, 0.0123, "12.346"), (0.5, 0.2, "0.50"), (1234.5, 130.0, "1230"), (3.14159, 0.0, "3.142"),

@@ -11,6 +11,7 @@ import pytest
 from heliograph.numerics.check import InputError
 from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
+from heliograph.serving.storage.carrying import Carrier
 from heliograph.serving.storage.store import LAYOUT, Store
 from heliograph.serving.storage.store_protocol import Damage, identity
 from tests.serving.worlds import fleet, lines, messages, stepping
@@ -158,7 +159,7 @@ def test_damage_is_one_line_with_what_to_do():
         ("drop table numbers", "damaged: no table numbers"),
     ],
 )
-def test_damage_beside_the_plants_ends_the_service_in_one_line(whole, tmp_path, mine, how, what):
+def test_damage_outside_the_plants_ends_the_service_in_one_line(whole, tmp_path, mine, how, what):
     place = copy(whole, tmp_path)
     changed(place, how)
     with pytest.raises(InputError, match=what) as error:
@@ -181,8 +182,10 @@ def test_plants_go_on_in_a_new_store_where_the_journal_is_damaged(whole, tmp_pat
     assert {item["reason"] for item in refused if item["plant"] == "p1"} == {"damaged"}
 
 
-def test_a_store_of_the_layout_before_is_refused_by_its_number(tmp_path, mine):
-    place = tmp_path / "a.db"
+@pytest.mark.parametrize("accepts", [False, True])
+def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_path, mine, accepts):
+    """With `--accept-changes` too: it does not say where the states of its filters stand."""
+    place, here = tmp_path / "a.db", fleet(stepping())
     for what in (
         "create table plants (name varchar(200) primary key, version bigint, body blob)",
         "create table journal (last bigint primary key, process varchar(200), lines text)",
@@ -190,12 +193,16 @@ def test_a_store_of_the_layout_before_is_refused_by_its_number(tmp_path, mine):
         "create table whose (name varchar(20) primary key, value text)",
     ):
         changed(place, what)
-    changed(place, "insert into whose values ('identity', ?)", json.dumps(mine))
+    changed(place, "insert into whose values ('identity', ?)", json.dumps(mine | {"heliograph": "0.1.0"}))
     changed(place, "insert into plants values ('p', 1, x'00')")
-    with pytest.raises(
-        ValueError, match=rf"\(layout of the store: {LAYOUT}\), got one that differs \(layout of the store: 1\); to beg"
-    ):
-        Store(str(place), mine)
+    said = []
+    with pytest.raises(InputError) as refused:
+        Store(str(place), mine, carrier=Carrier(here, mine, said.append) if accepts else None)
+    assert str(refused.value) == (
+        f"store {place}: expected layout {LAYOUT}, of heliograph {mine['heliograph']}, got layout 1, of heliograph "
+        "0.1.0, whose plants cannot be carried over; to begin anew, name another"
+    )
+    assert not said
 
 
 def test_no_byte_of_the_file_changes_what_is_informed(whole, tmp_path, mine):

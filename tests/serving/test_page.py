@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 pytest.importorskip("uvicorn")
 from heliograph.numerics.types import NameWithUnit
-from heliograph.serving.page import Door, door, shown
+from heliograph.serving.page import Door, Tallies, door, shown
 from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch, watch_of
 from tests.serving.watched import Scripted
 from tests.serving.worlds import stepping
@@ -177,6 +177,7 @@ def test_a_fusion_of_estimates_is_judged_by_what_it_fuses_and_a_dead_sender_is_a
         fused = view["tests"][-1]
         assert (fused["node"], fused["filter"], fused["claim"], fused["doubt"]) == ("fused", "both", "upper", doubted)
         assert fused["by"] == ["node 0/cubature", "node 1/cubature"] and fused["numbers"] == 2 * 600
+        assert f'heliograph_fusion_doubted{{filter="both"}} {float(doubted)}' in Tallies(watch).text().decode()
         assert view["senders"] == SENDERS
         dead = "node 2: its sender is dead: 9 heartbeats did not come, by chance once in 100,000"
         assert [line for line in view["warnings"] if "sender" in line] == [dead]
@@ -201,7 +202,11 @@ def test_a_browser_draws_axes_with_units_what_is_not_final_and_the_state_of_send
         assert path.count("L") == 300 - 4 - 1  # the line ends with the last final estimate
         names = re.findall(r'<th scope="row">(node \d+)</th>', text)
         assert names == [f"node {i}" for i in range(14)] and '<p id="search" class="choices">' in text
-        assert ">silent for 5 steps</td>" in text and ">dead: 9 heartbeats missed</td>" in text
+        assert (
+            ">14 nodes</span>" in text
+            and ">silent for 5 steps</td>" in text
+            and ">dead: 9 heartbeats missed</td>" in text
+        )
 
     looked(look, Scripted(nodes=14, waiting=4, senders=SENDERS), watch=watch)
 

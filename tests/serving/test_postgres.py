@@ -13,6 +13,7 @@ from heliograph.serving.storage.store_protocol import identity
 from tests.postgres import Postgres
 from tests.serving import test_sharing
 from tests.serving.storage.test_store import by_plant, journal, states
+from tests.serving.test_run_it_live import retuned
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 pytestmark = pytest.mark.real("PostgreSQL")
@@ -53,6 +54,11 @@ def test_processes_share_a_store_in_postgresql(tmp_path, database):
         Store(database, identity(fleet(network, window=6.0)))
     for service in count:
         service.store.close()
+
+
+def test_a_network_that_was_retuned_goes_on_from_its_store_in_postgresql(tmp_path, monkeypatch, capfd, database):
+    monkeypatch.chdir(tmp_path)
+    retuned(database, capfd)
 
 
 def test_parts_are_leased_in_postgresql(database):

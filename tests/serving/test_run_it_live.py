@@ -7,6 +7,7 @@ import shlex
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from pydantic import TypeAdapter
 
 from heliograph import cli
@@ -81,7 +82,7 @@ def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, cap
     )
 
 
-def test_the_state_is_kept_beside_the_network_unless_it_is_said_otherwise(tmp_path, monkeypatch, capfd):
+def test_the_state_is_stored_next_to_the_network_by_default(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Path("net.py").write_text(SMALL)
     Path("sent").write_bytes(b"\n".join(lines(messages(1, 40, 0, whole=True, longest=0.0))))
@@ -103,6 +104,35 @@ def test_the_state_is_kept_beside_the_network_unless_it_is_said_otherwise(tmp_pa
     assert cli.main(["serve", "net.py"]) == 2  # of another window
     said = capfd.readouterr().err
     assert "option window: 10.0" in said and said.endswith("; --accept-changes goes on with what fits\n")
+
+
+def retuned(store, capfd):
+    """Serve 20 steps, then 10 more with another noise of the plant, which is refused unless it is accepted."""
+    Path("net.py").write_text(SMALL)
+    sent = [json.loads(line) for line in lines(messages(1, 60, 0, whole=True, longest=0.0))]
+    for name, part in (("first", sent[:40]), ("rest", sent[40:])):
+        Path(name).write_text("\n".join(map(json.dumps, part)))
+    command = f"heliograph serve net.py --window 5 --store {shlex.quote(store)}"
+    first = piped(f"{command} < first", capfd)
+    Path("net.py").write_text(SMALL.replace("0.04", "0.09"))
+    assert cli.main(shlex.split(command)[1:]) == 2
+    assert capfd.readouterr().err.endswith("; --accept-changes goes on with what fits\n")
+    second = piped(f"{command} --accept-changes < rest", capfd)
+    assert "plant.noise.covariance: 0.04 -> 0.09\n" in SAID.read_text()
+    assert "numbers of" not in SAID.read_text() and "begins with the initial law" not in SAID.read_text()
+    times = [[item["time"] for item in part if item["kind"] == "final"] for part in (first, second)]
+    assert times[0] == [float(k) for k in range(14)] and times[1] == [float(k) for k in range(14, 24)]
+    ids = [item["id"] for item in (*first, *second) if item["kind"] == "final"]
+    assert ids == list(range(1, 25))  # the journal goes on
+    claimed = [[item["estimates"]["a"]["linear"]["covariance"][0][0] for item in part if item["kind"] == "final"]
+               for part in (first, second)]  # fmt: skip
+    assert claimed[1][-1] > claimed[0][-1]  # more noise, in steady state
+
+
+@pytest.mark.slow
+def test_a_network_that_was_retuned_goes_on_from_its_store(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    retuned("net.db", capfd)
 
 
 def test_a_store_is_called_as_its_network():

@@ -116,7 +116,7 @@ def test_any_order_and_twice_is_the_same(tmp_path):
         assert finals(item, plant) == finals(two, plant)
 
 
-def test_surprise_is_that_of_the_innovation():
+def test_nis_is_that_of_the_innovation():
     """e^2 / S of the filter stepped by itself; 1e-12, two programs that are compiled apart."""
     network = stepping()
     alone = network.nodes["a"].filters["linear"]

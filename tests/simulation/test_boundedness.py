@@ -68,7 +68,7 @@ def test_between_the_two_conditions_nothing_is_said(arrival, verdict):
     ("first", "second", "verdict", "why"),
     [(0.85, 0.56, "certified", "radius"), (0.83, 0.56, "impossible", "2.5"), (0.85, 0.55, "impossible", "1.5")],
 )
-def test_components_that_are_lost_on_their_own(first, second, verdict, why):
+def test_components_that_are_lost_independently(first, second, verdict, why):
     """diag(2.5, 1.5): each component needs 1 - 1/a^2, 0.84 and 0.5556; two nodes are one node with two links."""
     both = judged(
         plant(np.diag([2.5, 1.5])),
@@ -116,7 +116,7 @@ def test_the_exact_filter_diverges_where_that_is_said():
     assert fast[-1] > 1e4 * fast[10]
 
 
-def test_a_stable_plant_is_bounded_by_its_own_covariance():
+def test_a_stable_plant_is_bounded_by_its_stationary_covariance():
     result = scalar(hg.hop(hg.Rayleigh(1.0), 0.1), a=[[0.9]])
     assert result.verdict == "certified" and "the plant is stable" in result.reason
     np.testing.assert_allclose(result.bound, 1 / (1 - 0.81))
@@ -192,7 +192,7 @@ def test_bounds_under_bursts(fail, recover, bound):
 
 
 def test_links_with_shared_fading_fail_together():
-    """Two sensors: on chains of their own both are silent for long with rho 0.5^2, in one shadow with rho 0.5."""
+    """Two sensors: on chains of their own both are silent for long with rho 0.5^2, with one fading state rho 0.5."""
     sensor = hg.LinearSensor([[1.0]], 1.0)
     local = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))
     shared = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5, "hill")), (sensor, bursts(0.2, 0.5, "hill")))

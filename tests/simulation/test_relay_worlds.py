@@ -8,8 +8,7 @@ from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.relays.design import own_error_design, relay_schedules
-from heliograph.relays.receiver import receiver_behind_relays
+from heliograph.relays.design import own_error_design, receiver_behind_relays, relay_schedules
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run

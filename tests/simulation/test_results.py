@@ -158,7 +158,7 @@ def test_labels_select_what_they_say(runs, result):
     np.testing.assert_allclose(of, np.sqrt(squares.mean(axis=0)), rtol=1e-12)  # sums in another order
 
 
-def test_every_state_has_its_own_rmse(runs, result):
+def test_every_state_has_an_rmse(runs, result):
     squares = (runs.errors("cart", "aware") ** 2).mean(axis=(0, 1))
     assert runs.rmse("cart", "aware") == dict(zip(runs.states, np.sqrt(squares), strict=True))
     local, error = result["cart"]["aware"].rmse_by_state()

@@ -1,4 +1,4 @@
-"""Nodes whose links hold one memory are in one shadow, whatever they are called and however runs are cut."""
+"""Nodes whose links hold one memory share one fading state, whatever they are called and however runs are cut."""
 
 import numpy as np
 import pytest

@@ -34,7 +34,7 @@ def stages(folder):
     return Stages("learning", no_progress, folder, "the same setting")
 
 
-def test_a_batch_is_counted_once_and_kept(tmp_path, monkeypatch):
+def test_a_batch_is_counted_once_and_stored(tmp_path, monkeypatch):
     """Few and short recordings: intervals by cosines cover most of the truth, and the second call computes nothing."""
     row, setting = ROWS[3]._replace(steps=200), Setting(batches=1, batch=32)
     assert row.name == "two_point" and row.form == "conditional"
@@ -86,7 +86,7 @@ def test_the_page_shows_every_row_and_the_recorded_drive(outcome, fits):
         assert words in html
 
 
-def test_pieces_of_the_drive_are_found_once_and_kept(tmp_path, monkeypatch):
+def test_pieces_of_the_drive_are_computed_once_and_stored(tmp_path, monkeypatch):
     pytest.importorskip("gtsam")
     calls = []
     monkeypatch.setattr(compute, "of_direct", lambda recording: calls.append("direct") or {"rmse": 0.3})

@@ -39,24 +39,24 @@ def sweep(
     if only is not None and workers is None:
         workers = 0  # so that a debugger can follow
     # Compute with a progress bar, then write the report from the new scores.
-    with showing(workers or os.cpu_count() or 1) as tell:
-        result = run_campaign(campaign, out, workers, scheduler, only, tell)
+    with showing(workers or os.cpu_count() or 1) as progress:
+        outcome = run_campaign(campaign, out, workers, scheduler, only, progress)
     scores = read_summary(out / SUMMARY)
     report = write_report(campaign, scores, out)
     print_scores(campaign, scores)
     console = rich.console.Console()
-    console.print(_done(result), soft_wrap=True, highlight=False, markup=False)
+    console.print(_done(outcome), soft_wrap=True, highlight=False, markup=False)
     console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
     # Problems go to stderr: damaged files, and failures with the way to repeat them.
-    for file in result.damaged:
+    for file in outcome.damaged:
         print(f"heliograph: damaged, so it does not count as done: {file}", file=sys.stderr)
-    for failure in result.failures:
+    for failure in outcome.failures:
         if only is not None:
             print(failure.traceback, end="", file=sys.stderr)
         print(f"heliograph: failed: {visible(str(failure))}", file=sys.stderr)
-    if result.failures:
+    if outcome.failures:
         print(f"heliograph: {out / FAILURES} says how to run each of them again alone", file=sys.stderr)
-    return FAILED if result.failures else 0
+    return FAILED if outcome.failures else 0
 
 
 def _only(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:

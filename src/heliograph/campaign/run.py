@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from typing_extensions import TypeAliasType
+
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, failure, write_failures
 from heliograph.campaign.plan import Campaign
@@ -30,7 +32,7 @@ from heliograph.numerics.check import check_count, fail, file_path, instance
 from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
-Tell = Callable[[str, int, int], None]
+Progress = TypeAliasType("Progress", Callable[[str, int, int], None])
 Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, and how many are done
 
 
@@ -60,7 +62,7 @@ def run_campaign(
     workers: int | None = None,
     scheduler: str | None = None,
     only: Sequence[tuple[int, int]] | None = None,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> CampaignRun:
     """Compute what a campaign's results folder lacks: results.zarr, summary.csv, and failures.json if a chunk failed.
 
@@ -75,7 +77,7 @@ def run_campaign(
         workers: number of worker processes, by default one for each CPU; 0 computes in this process.
         scheduler: address of a Dask scheduler, used instead of worker processes.
         only: (setting, chunk) pairs to compute; by default all.
-        tell: called as tell(what, done, total) to report progress.
+        progress: called as progress(what, done, total) to report progress.
 
     Raises:
         ValueError: a folder of something else or of another campaign, or one in use; a setting or chunk that does not
@@ -84,12 +86,12 @@ def run_campaign(
         ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
     """
     instance("campaign", campaign, Campaign, "one from load_campaign")
-    out, tell = file_path("results folder", out), tell or (lambda what, done, total: None)
+    out, progress = file_path("results folder", out), progress or (lambda what, done, total: None)
     check_output_folder(out)
     with only_here(out) as alone:
         if not alone:
             raise fail(f"results folder {out}", "no other campaign at work in it", "one that is")
-        return _run(campaign, out, workers, scheduler, only, tell)
+        return _run(campaign, out, workers, scheduler, only, progress)
 
 
 def _run(
@@ -98,7 +100,7 @@ def _run(
     workers: int | None,
     scheduler: str | None,
     only: Sequence[tuple[int, int]] | None,
-    tell: Tell,
+    progress: Progress,
 ) -> CampaignRun:
     store = (out / STORE).absolute()
     clear_left(store)
@@ -122,7 +124,7 @@ def _run(
         count = _count(workers, len(missing) or 1)
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
-            failed = _compute(engine, campaign, store, missing, already, tell)
+            failed = _compute(engine, campaign, store, missing, already, progress)
     remove_partial(store)
     # Reports are written again after every call.
     failures = [failure(campaign, out, job, reply) for job, reply in failed.items()]
@@ -133,14 +135,19 @@ def _run(
 
 
 def _compute(
-    engine: Engine, campaign: Campaign, store: Path, missing: Sequence[Job], already: int, tell: Tell
+    engine: Engine,
+    campaign: Campaign,
+    store: Path,
+    missing: Sequence[Job],
+    already: int,
+    progress: Progress,
 ) -> dict[Job, Reply]:
     """Describe new settings, then compute the chunks of those that can be built; return failures, in order."""
-    failed = _describe(engine, campaign, store, {job.setting for job in missing}, tell)
+    failed = _describe(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
-    tell("simulating", already, total)
-    failed |= _try(engine, possible, lambda job, value, done: tell("simulating", already + done, total))
+    progress("simulating", already, total)
+    failed |= _try(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
     return dict(sorted(failed.items(), key=lambda item: (item[0].setting, item[0].chunk or 0)))
 
 
@@ -163,7 +170,9 @@ def _count(workers: int | None, jobs: int) -> int:
     return min(check_count("workers", workers, 0), jobs)
 
 
-def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int], tell: Tell) -> dict[Job, Reply]:
+def _describe(
+    engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
+) -> dict[Job, Reply]:
     """Make the store if needed, and write missing claims; return the settings that cannot be built."""
     new = not store.is_dir()
     # Claims are needed of a new store, of the settings to compute, and of those whose claims were damaged.
@@ -176,7 +185,7 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
     def accept(job: Job, value: Description | None, done: int) -> None:
         assert value is not None  # these jobs only describe
         results[job.setting] = value
-        tell("building", done, len(jobs))
+        progress("building", done, len(jobs))
 
     failed = _try(engine, jobs, accept)
     if new and not results:

@@ -12,7 +12,7 @@ import rich.table
 from rich.text import Text
 
 from heliograph.campaign.plan import Campaign
-from heliograph.campaign.run import Tell
+from heliograph.campaign.run import Progress
 from heliograph.campaign.summary import Score
 from heliograph.disk.quoting import visible
 from heliograph.report.progress import Countdown, counting
@@ -21,19 +21,19 @@ ROWS = 30  # of the printed table; the file has all
 
 
 @contextmanager
-def showing(workers: int) -> Iterator[Tell]:
+def showing(workers: int) -> Iterator[Progress]:
     """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
     countdown = Countdown(workers)
     with counting(countdown) as show:
 
-        def tell(what: str, done: int, total: int) -> None:
+        def progress(what: str, done: int, total: int) -> None:
             if what == "simulating":
                 if countdown.first is None and done:
                     print(f"{done} of {total} chunks are already there", file=sys.stderr)
                 countdown.note(done)
             show(what, done, total)
 
-        yield tell
+        yield progress
 
 
 def score_headers(campaign: Campaign) -> list[str]:

@@ -199,10 +199,10 @@ def _write_report(name: str, network: "Network", record: "Record", recording: "R
     from heliograph.report.health import Health, examine
     from heliograph.report.results import Results, write_results
 
-    def tell(health: Health) -> Results:
+    def results_of(health: Health) -> Results:
         from heliograph.report.run_page import run_results
 
         return run_results(health, name)
 
     count = sum(map(len, network.claims().values()))
-    write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), tell)
+    write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), results_of)

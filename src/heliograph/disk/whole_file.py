@@ -172,9 +172,6 @@ def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
     Args:
         path: file to be written.
         formats: extensions that are allowed.
-
-    Raises:
-        ValueError: another extension, a folder at `path`, a folder that is missing or cannot be written.
     """
     path = Path(path)
     if format_of(path, formats) == ".parquet":
@@ -200,11 +197,7 @@ def check_output_folder(folder: str | Path) -> None:
 
 
 def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    """Return the extension of a file name in lower case, which determines the format.
-
-    Raises:
-        ValueError: an extension that is not among `formats`.
-    """
+    """Return the extension of a file name in lower case, which determines the format."""
     kind = path.suffix.lower()
     if kind not in formats:
         raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))

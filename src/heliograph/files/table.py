@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped
 
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import check_output, format_of, whole_file
 from heliograph.numerics.check import fail, file_path, shown, table
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
+from heliograph.numerics.types import Shaped
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")

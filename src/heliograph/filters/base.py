@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
@@ -145,19 +145,8 @@ class AbstractFilter(Module):
         z, u = measured(self, z), given(self, u)
         return _step_with_smoother(self, state, z, u, step_number(self, k))
 
-    def smoother_step(
-        self, before: PyTree, prior: PyTree, after: PyTree, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
-        """Return the smoother step k: what the backward pass needs of it.
-
-        Args:
-            before: the filter's state before the step.
-            prior: the state after `predict`.
-            after: the state after `correct`.
-            innovation: the innovation of the correction.
-            z: measurement (received,).
-            u: input (inputs,).
-            k: number of the step.
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+        """Return what the backward pass needs of a step, from the filter's states around it.
 
         Raises:
             ValueError: a filter without a covariance that `correct` updates, or without a known motion of its state.
@@ -224,7 +213,7 @@ def _step_with_smoother(
 ) -> tuple[PyTree, AbstractSmootherStep]:
     prior = item.predict(state, u, k)
     after, innovation = item.correct(prior, z, k)
-    return after, with_nis(item.smoother_step(state, prior, after, innovation, z, u, k), innovation)
+    return after, with_nis(item.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
@@ -253,9 +242,6 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     """Return z as a measurement of the filter's length, NaN where a component did not arrive.
 
     Empty for a filter that uses no measurements.
-
-    Raises:
-        ValueError: another shape, infinite values, or no real numbers.
     """
     result = _numbers("measurement", z, item.received or None)
     if isinstance(result, np.ndarray) and np.isinf(result).any():
@@ -264,11 +250,7 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
 
 
 def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
-    """Return u as an input of the filter's length.
-
-    Raises:
-        ValueError: another shape, values that are not finite, or no real numbers.
-    """
+    """Return u as an input of the filter's length."""
     result = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
     if isinstance(result, np.ndarray) and not np.isfinite(result).all():
         raise fail("inputs", "finite numbers", np.asarray(result).tolist())
@@ -276,11 +258,7 @@ def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
 
 
 def step_number(item: AbstractFilter, k: Step) -> Step:
-    """Return k as the number of a step that the filter covers.
-
-    Raises:
-        ValueError: no whole number, a negative one, or one past the end of what varies over time.
-    """
+    """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k
     if (

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.model.channel import Channel
@@ -16,10 +15,9 @@ from heliograph.numerics.linalg import add, times_vector
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import Array
-from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 from heliograph.random_affine.outliers import (

@@ -89,11 +89,7 @@ _by_xla = quickly_compiled(_results)
 def data_of(
     item: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
-    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed.
-
-    Raises:
-        ValueError: another shape than the filter's, infinite values, missing inputs, more steps than the filter covers.
-    """
+    """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed."""
     z = rows("measurements", measurements, None, item.received or None, missing=True)
     z = z if item.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not item.inputs else inputs

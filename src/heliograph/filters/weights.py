@@ -4,12 +4,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heliograph.filters.gaussian.scores import AbstractWeights, Expected, reweighted, squared_residuals
 from heliograph.numerics.check import TINY, check_count, scalar
 from heliograph.numerics.linalg import diagonal_of
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 Number = Float[jax.Array | np.ndarray, ""]
 Degrees = Float[jax.Array | np.ndarray, " m"]

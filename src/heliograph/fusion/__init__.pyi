@@ -3,7 +3,7 @@
 from .all_reports import (
     AllReports as AllReports,
 )
-from .event import (
+from .report_link import (
     EventSending as EventSending,
 )
 from .informed import (
@@ -11,7 +11,7 @@ from .informed import (
     MatrixWeights as MatrixWeights,
     ScalarWeights as ScalarWeights,
 )
-from .level import (
+from .weights import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
     level_weights as level_weights,
@@ -28,10 +28,10 @@ from .quantizer import (
     AbstractQuantizer as AbstractQuantizer,
     Quantized as Quantized,
 )
-from .escape_quantizer import (
+from .quantizer import (
     EscapeQuantizer as EscapeQuantizer,
 )
-from .uniform_quantizer import (
+from .quantizer import (
     UniformQuantizer as UniformQuantizer,
 )
 from .report_link import (

@@ -1,16 +1,20 @@
 """Quantizers on the uplinks from filters to a fusion centre: received values and their error bounds."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.estimate import Claim
+from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Numbers = TypeAliasType("Numbers", Float[Array, "*n"])
@@ -87,3 +91,269 @@ def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[ja
     s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
     share = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
     return (1 + share) * covariance + (r + s) * jnp.diag(error)
+
+
+Parameter = Float[Array, "..."]  # of all components, or of each
+
+
+def segment_of(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
+    """Index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
+    return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
+
+
+def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
+    """Midpoint of a segment; exactly zero for the middle one of an odd number.
+
+    The amplitude's power of two is factored out, which changes no bit, or its product with many levels would overflow.
+    """
+    fraction, power = jnp.frexp(jnp.asarray(amplitude))
+    return jnp.ldexp((2 * segment + 1 - levels) * fraction / levels, power)
+
+
+def levels_of(value: int) -> Float[np.ndarray, ""]:
+    """Return the number of segments, at least two, as a float."""
+    check_count("levels", value, 2)
+    return np.asarray(value, dtype=np.float64)
+
+
+def parameter(name: str, value: ArrayLike) -> Parameter:
+    """Return a parameter as a number, or as one number per component."""
+    several = isinstance(value, Sequence) or np.ndim(value) > 0
+    result: Parameter = array(name, value, (None,) if several else ())
+    return result
+
+
+def positive(name: str, value: ArrayLike) -> Parameter:
+    """Return a parameter that is positive."""
+    result = parameter(name, value)
+    if not isinstance(result, jax.Array) and np.any(result <= 0):
+        raise fail(name, "positive numbers", value)
+    return result
+
+
+def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
+    """Raise ValueError unless the amplitude and the error of a level are numbers, the latter to full precision."""
+    if is_traced(amplitude, scale):
+        return
+    with np.errstate(over="ignore", under="ignore"):
+        reach = np.asarray(amplitude) * scale
+        inside = np.isfinite(reach) & (reach / levels >= np.finfo(np.float64).tiny)
+    if not np.all(inside):
+        least = np.finfo(np.float64).tiny * float(levels)
+        raise fail(name, f"from {least:.3g} to {np.finfo(np.float64).max:.3g}", reach.tolist())
+
+
+class UniformQuantizer(AbstractQuantizer):
+    """Midpoints of `levels` equal segments of [-amplitude, amplitude], its ends outside: u q(x / u), u = scale.
+
+    |error| <= scale amplitude / levels where x / u lies within the amplitude; outside nothing is guaranteed. Errors and
+    their bounds do not depend on the data, so what was "upper" stays so.
+
+    Args:
+        levels: number of segments, at least 2.
+        amplitude: positive, a number or (n,).
+        scale: unit u of x, positive, a number or (n,); 1 by default.
+
+    Raises:
+        ValueError: fewer than two levels, an amplitude or scale that is not positive, an amplitude or an error beyond
+            the range of numbers.
+
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
+    """
+
+    levels: Float[Array, ""]
+    amplitude: Parameter
+    scale: Parameter
+
+    def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
+        self.levels = levels_of(levels)
+        self.amplitude, self.scale = positive("amplitude", amplitude), positive("scale", scale)
+        check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
+
+    def init(self, n: int) -> tuple[()]:
+        """Return the empty state."""
+        return ()
+
+    @in_float64
+    def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
+        """Quantize with the fixed amplitude."""
+        return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
+
+    def error(self, n: int) -> Float[Array, " n"]:
+        """Half of a segment's length."""
+        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
+
+    def claim(self, claim: Claim) -> Claim:
+        """Lower a claim to "upper" at most."""
+        return weakest([claim, "upper"])
+
+
+def _published(
+    x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
+) -> Quantized:
+    """Equations (10), (11) and (13), with d for values from d on and -d for values below -d."""
+    scaled = x / scale
+    inside = midpoint(segment_of(scaled, amplitude, levels), amplitude, levels)
+    value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
+    saturated = jnp.abs(scaled) > amplitude
+    error = jnp.where(saturated | ~jnp.isfinite(x), jnp.nan, scale * amplitude / levels)
+    return Quantized(scale * value, error, saturated, jnp.ones(x.shape, dtype=int))
+
+
+class Symbols(NamedTuple):
+    """Symbols sent over the uplink for one value, by component.
+
+    How many escapes, then the segment from 0: -1 for NaN, `ABOVE` and `BELOW` for a value beyond the range of numbers.
+    `number` counts the values that were sent; `restart` says that the first amplitude is used.
+    """
+
+    escapes: Int[Array, "*n"]
+    segment: Int[Array, "*n"]
+    number: Int[Array, "*n"]
+    restart: Bool[Array, "*n"]
+
+
+NOTHING, BELOW, ABOVE = -1, -2, -3  # segments that are none
+LOST = -1  # the number of the next value for a receiver that has missed one
+
+
+class UplinkState(NamedTuple):
+    """State of one end of an uplink, by component: the next amplitude, and the number of the next value.
+
+    A receiver that has missed a value does not know the amplitude: `number` is negative then.
+    """
+
+    amplitude: Float[Array, "*n"]
+    number: Int[Array, "*n"]
+
+    @property
+    def synchronised(self) -> Bool[Array, "*n"]:
+        """True where the end knows the amplitude."""
+        return self.number >= 0
+
+
+class EscapeQuantizer(AbstractQuantizer):
+    """A decodable quantizer that does not saturate, driven by nothing but what was sent.
+
+    Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
+    Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
+    d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one. Only a value whose d 2^m would
+    be no number saturates.
+
+    A value that is lost on the way leaves the receiver with a wrong d. It detects that from the number of the next one:
+    from then on it delivers NaN, without an error bound, and its state is not `synchronised`, until the sender restarts
+    from the first amplitude. That is so with every `interval`-th value, and with any that `encode` restarts with. So
+    after a loss the error bound holds again within `interval` values; without either, never.
+
+    Args:
+        levels: odd number of segments, at least 3.
+        amplitude: first amplitude, a number or (n,).
+        decay: factor of the amplitude, in (0, 1); a number or (n,).
+        growth: factor of the sent value in the next amplitude, from 0; a number or (n,).
+        smallest: least amplitude, a number or (n,).
+        interval: number of values between restarts; None, the default, never restarts.
+
+    Raises:
+        ValueError: an even number of levels or fewer than three, amplitude or smallest amplitude not positive or beyond
+            the range of numbers, decay outside (0, 1), negative growth, an interval below 1.
+    """
+
+    levels: Float[Array, ""]
+    amplitude: Parameter
+    decay: Parameter
+    growth: Parameter
+    smallest: Parameter
+    interval: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        levels: int,
+        amplitude: Float[ArrayLike, "*n"],
+        decay: Float[ArrayLike, "*n"],
+        growth: Float[ArrayLike, "*n"],
+        smallest: Float[ArrayLike, "*n"],
+        interval: int | None = None,
+    ):
+        self.levels = levels_of(levels)
+        if levels % 2 == 0:
+            raise fail("levels", "an odd number, so that zero is a level", levels)
+        self.amplitude, self.smallest = positive("amplitude", amplitude), positive("smallest amplitude", smallest)
+        for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
+            check_range(name, value, np.ones(()), self.levels)
+        self.decay, self.growth = _decay(decay), _growth(growth)
+        self.interval = None if interval is None else check_count("interval", interval)
+
+    @in_float64
+    def init(self, n: int) -> UplinkState:
+        """Return the first amplitude, known to both ends."""
+        count = check_count("components", n)
+        return UplinkState(jnp.broadcast_to(jnp.asarray(self.amplitude), (count,)), jnp.zeros(count, int))
+
+    @in_float64
+    def step(self, state: UplinkState, value: ArrayLike) -> tuple[UplinkState, Quantized]:
+        """Encode a value at the sender and decode it at the receiver."""
+        return self.decode(state, self.encode(state, value))
+
+    @in_float64
+    def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
+        """Encode a value (n,), from the amplitude that both ends know, or from the first one."""
+        x = jnp.asarray(value, dtype=float)
+        anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
+        amplitude = self._amplitude(state, anew)
+        # m = ceil(log2(|x| / d)) by exponents, without rounding.
+        (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
+        doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
+        most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
+        known, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
+        escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
+        segment = segment_of(x, jnp.ldexp(amplitude, escapes), self.levels)
+        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(known, segment, NOTHING))
+        numbers = jnp.broadcast_to(state.number, x.shape)
+        return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int), numbers, anew & known)
+
+    @in_float64
+    def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
+        """Decode at the receiver: next state and value, from the present state and the symbols alone."""
+        escapes, segment, number, restart = (jnp.asarray(part) for part in symbols)
+        restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        # A missed number means a wrong amplitude, until a restart.
+        synchronised = restart | (state.number == number)
+        # Midpoint of the segment at the doubled amplitude d 2^m.
+        used = jnp.ldexp(self._amplitude(state, restart), escapes)
+        inside = midpoint(segment, used, self.levels)
+        sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
+        largest = np.finfo(used.dtype).max
+        # Next amplitude max(smallest, decay d 2^m + growth |sent|).
+        following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
+        known = there & synchronised
+        value = jnp.where(known, sent, jnp.nan)
+        error = jnp.where(known & ~beyond, used / self.levels, jnp.nan)
+        after = UplinkState(
+            jnp.where(known, following, state.amplitude),
+            jnp.where(there, jnp.where(synchronised, number + 1, LOST), state.number),
+        )
+        return after, Quantized(value, error, known & beyond, escapes + 1)
+
+    def _restarts(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+        return number == 0 if self.interval is None else number % self.interval == 0
+
+    def _amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
+        return jnp.where(restart, self.amplitude, state.amplitude)
+
+    def claim(self, claim: Claim) -> Claim:
+        """Lower a claim to "nominal": the amplitude depends on the data, and may be small where errors are large."""
+        return weakest([claim, "nominal"])
+
+
+def _decay(value: ArrayLike) -> Parameter:
+    decay = parameter("decay", value)
+    if not isinstance(decay, jax.Array) and np.any((decay <= 0) | (decay >= 1)):
+        raise fail("decay", "numbers between 0 and 1", value)
+    return decay
+
+
+def _growth(value: ArrayLike) -> Parameter:
+    growth = parameter("growth", value)
+    if not isinstance(growth, jax.Array) and np.any(growth < 0):
+        raise fail("growth", "no negative number", value)
+    return growth

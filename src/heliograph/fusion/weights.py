@@ -1,4 +1,4 @@
-"""Best linear unbiased weights of several estimates with a known joint error covariance, also a singular one."""
+"""Weights of estimates: the best unbiased ones for a joint error covariance, and those of H-infinity levels."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import array, fail, probabilities, shown
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import eigh, regular_solve, symmetrize
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, ArrayLike, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
 
@@ -117,3 +117,85 @@ def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) 
 def weighted(weights: Float[jax.Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
     """W P W'."""
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
+
+
+def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
+    """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
+
+    By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
+    linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
+
+    Raises:
+        ValueError: levels that are not positive.
+
+    Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
+    """
+    gamma = _levels(levels)
+    inverse = (gamma.min() / gamma) ** 2  # relative to the smallest level: at most 1, so that nothing overflows
+    return np.asarray(inverse / inverse.sum())
+
+
+def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
+    """sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
+
+    The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
+    the gamma_i, `weights` (N,) the c_i.
+
+    Raises:
+        ValueError: levels that are not positive, weights off the simplex or not as many.
+
+    Source: Minkowski's inequality, in place of H-infinity quantized fusion, equation (34).
+    """
+    gamma, c = _levels_and_weights(levels, weights)
+    return float(c @ gamma)
+
+
+def fused_error_norm(
+    levels: Float[ArrayLike, " N"],
+    weights: Float[ArrayLike, " N"],
+    disturbances: Float[ArrayLike, " N"],
+    matrix: Float[ArrayLike, "outputs n"],
+    errors: Float[ArrayLike, "N time n"],
+) -> float:
+    """Bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
+
+    sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||), since z - zhat = sum c_i (M e_i - M mu_i) and |mu_i| <= D_i by
+    component; ||D_i|| is the root of the sum over steps and components. NaN where a quantizer saturated: its D is NaN,
+    and nothing is guaranteed.
+
+    Args:
+        levels: gamma_i (N,).
+        weights: c_i (N,), on the simplex.
+        disturbances: norms ||w_i|| (N,).
+        matrix: output matrix M (outputs, n).
+        errors: bounds D_i of the quantizers (N, time, n).
+
+    Raises:
+        ValueError: levels that are not positive, weights off the simplex, negative norms or errors, shapes that do not
+            fit.
+
+    Source: Minkowski's inequality, in place of H-infinity quantized fusion, equations (34) to (37).
+    """
+    # Shapes and signs.
+    gamma, c = _levels_and_weights(levels, weights)
+    norms, m = array("disturbances", disturbances, (len(gamma),)), array("output matrix", matrix, (None, None))
+    d = np.asarray(errors, dtype=np.float64)
+    if d.ndim != 3 or (d.shape[0], d.shape[2]) != (len(gamma), m.shape[1]):
+        raise fail("errors", f"shape ({len(gamma)}, any, {m.shape[1]})", f"shape {d.shape}")
+    if np.any(norms < 0) or np.any(d < 0):
+        raise fail("disturbances and errors", "no negative number", float(min(norms.min(), np.nanmin(d))))
+    # ||M|| ||D_i||.
+    quantization = np.linalg.norm(m, 2) * np.sqrt(np.sum(d**2, axis=(1, 2)))
+    return float(c @ (gamma * norms + quantization))
+
+
+def _levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
+    checked = np.asarray(array("levels", levels, (None,)))
+    if not len(checked) or np.any(checked <= 0):
+        raise fail("levels", "positive numbers", checked.tolist())
+    return checked
+
+
+def _levels_and_weights(levels: ArrayLike, weights: ArrayLike) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    gamma = _levels(levels)
+    return gamma, probabilities("fusion weights", weights, len(gamma))

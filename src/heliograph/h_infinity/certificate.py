@@ -93,21 +93,21 @@ def certify_level(
     # initial condition: level^2 W - P_0 > 0
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
-    local = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
+    initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
     # distance from failing, free of units
     definite = np.array([smallest_eigenvalue(p) for p in P])
-    margin = min(local, *(-_scaled_largest(phi) for phi in matrices))
+    margin = min(initial_margin, *(-_scaled_largest(phi) for phi in matrices))
     # every condition that fails, in words
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
-    if not local > ROUNDING:
+    if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
     constants = _constants(system)
     reasons += _against(constants, growth)
     count = T if negative.all() else int(np.argmin(negative))
-    known = tuple(growth), tuple(reasons), _assumed(constants, growth)
-    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *known)
+    findings = tuple(growth), tuple(reasons), _assumed(constants, growth)
+    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *findings)
 
 
 def _against(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> list[str]:

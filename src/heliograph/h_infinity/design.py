@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.h_infinity.scaling import scale
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -20,7 +19,15 @@ from heliograph.h_infinity.solver import (
     check_choice,
     run_solver,
 )
-from heliograph.h_infinity.step import Layout, StepMatrices, Unknowns, all_multipliers, next_energy, step_matrices
+from heliograph.h_infinity.step import (
+    Layout,
+    StepMatrices,
+    Unknowns,
+    all_multipliers,
+    next_energy,
+    scale,
+    step_matrices,
+)
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.module import readable
@@ -161,11 +168,11 @@ def horizon_design(
     instance("system", system, GrowthSystem, "a GrowthSystem")
     check_choice("solver", solver, Solver)
     n, m = system.states, system.received
-    given = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
+    given_gains = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
     # coordinates of order one, and the unknowns of every step
-    steps, coordinates = scale(system, step_matrices(system, separate), given)
-    local = None if given is None else np.zeros((n, m))  # as a correction of the given ones
-    layouts = [Layout(n, m, len(s.growth), local) for s in steps]
+    steps, coordinates = scale(system, step_matrices(system, separate), given_gains)
+    given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
+    layouts = [Layout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.scaled_weight(_weight(initial, n), 0)
     allowed = coordinates.unit**2 * coordinates.scaled_weight(system.initial_weight, 0)
     # one convex problem in all weights, gains, multipliers and the level squared
@@ -176,10 +183,10 @@ def horizon_design(
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     # the solver's answer must satisfy every step's inequality itself
     parts = [np.asarray(values[place]) for place in problem.places]
-    results = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
+    solved = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
-    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, results)]
-    for k, (step, unknowns) in enumerate(zip(steps, results, strict=True)):
+    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, solved)]
+    for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
         fixed[: 2 * n, : 2 * n] -= weights[k]
         if not _holds(step, unknowns, fixed, SCREEN * square):
@@ -187,10 +194,10 @@ def horizon_design(
             return _empty(system, separate, float("nan"), text)._replace(failed_step=k)
     # back to the user's units
     level = float(np.sqrt(square)) * coordinates.unit
-    chosen = given
+    chosen = given_gains
     if chosen is None:
-        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(results)])
-    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(results)])
+        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(solved)])
+    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     proven = all_multipliers(system, multipliers, separate)
     return HInfinityDesign(level, chosen, unscaled, proven, True, status)

@@ -34,11 +34,7 @@ class Interval(NamedTuple):
 
 
 def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
-    """Evaluate a traced function on intervals; `continuous` refuses an open decision, at which the function could jump.
-
-    Raises:
-        UnknownError: an operation or a decision that cannot be followed.
-    """
+    """Evaluate a traced function on intervals; `continuous` refuses an open decision, where the function may jump."""
     values: dict[core.Var, Interval] = {}
 
     def read(atom: core.Var | core.Literal) -> Interval:

@@ -33,11 +33,7 @@ SCS_ITERATIONS = 100_000
 
 
 def solvers() -> ModuleType:
-    """Import cvxpy, or raise an error that says how to get it.
-
-    Raises:
-        ModuleNotFoundError: cvxpy is not installed.
-    """
+    """Import cvxpy, or raise an error that says how to get it."""
     try:
         import cvxpy
     except ModuleNotFoundError as error:

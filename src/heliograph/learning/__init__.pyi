@@ -40,10 +40,6 @@ from .identification import (
     Identifiability as Identifiability,
     identifiable as identifiable,
 )
-from .recordings_apart import (
-    FitEach as FitEach,
-    fit_each as fit_each,
-)
 from .parameters import (
     Parameters as Parameters,
 )

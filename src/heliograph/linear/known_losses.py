@@ -69,11 +69,7 @@ def long_run_law(initial: Float[np.ndarray, "modes"], chain: Float[np.ndarray, "
 
 
 def operator(system: KnownLossSystem, gains: KindGains) -> Float[np.ndarray, "N N"]:
-    """U -> sum_i chain[i, j] F_i U_i F_i' on all entries; where modes are independent, that of the sum of all U.
-
-    Raises:
-        ValueError: more than SIZE_LIMIT rows.
-    """
+    """U -> sum_i chain[i, j] F_i U_i F_i' on all entries; where modes are independent, that of the sum of all U."""
     n, modes = len(system.transition), len(system.chain)
     size = n * n * (1 if system.forgets else modes)
     if size > SIZE_LIMIT:

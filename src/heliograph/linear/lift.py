@@ -14,9 +14,8 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.linalg import with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
+from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents, position
@@ -300,11 +299,7 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 
 
 def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
-    """The maps of each step, with the noises' moments up to `order` computed once for what does not vary.
-
-    Raises:
-        ValueError: something varies over fewer steps than `horizon`.
-    """
+    """The maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
     plants = _maps(each_step(plant, horizon), order)
     sensors = _maps(each_step(sensor, horizon), order)
     channels = each_step(channel, horizon)
@@ -330,11 +325,7 @@ def _maps(items: Sequence[PyTree], order: int) -> list[GainAndNoise]:
 
 
 def each_step(item: T | OverTime, horizon: int) -> list[T]:
-    """A plant, sensor or channel at each of `horizon` steps.
-
-    Raises:
-        ValueError: a horizon that is no positive whole number, or an item that varies over fewer steps than that.
-    """
+    """A plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
     if not isinstance(item, OverTime):
         return [item] * horizon

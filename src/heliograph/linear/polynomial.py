@@ -25,9 +25,8 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.monomials import exponents, symmetric_power
 from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
@@ -39,9 +38,6 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
 
     Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
     `linear` is a schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
-
-    Raises:
-        ValueError: what `lifted_system` refuses, or a schedule whose state is not an estimate of x.
     """
     check_model(plant, sensor, channel)
     start, horizon = first(plant), linear.horizon

@@ -27,10 +27,13 @@ class Corrected(NamedTuple):
     covariance: Float[np.ndarray, "N N"]
 
 
-def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
+def covariance_step(
+    spread: Float[np.ndarray, "N N"], s: Steps, size: Float[np.ndarray, " N"] | float = 0.0
+) -> Corrected:
     """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-.
 
     O may be singular (products of a measurement with few values repeat): then directions it does not have are skipped.
+    Of a variance of which next to nothing is left the mean cannot say ((N + 2) eps)^2 `size`, E[y^2] at the start.
     """
     predicted = s.transition @ spread @ s.transition.T + s.process
     cross = s.output @ predicted
@@ -42,6 +45,8 @@ def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
         keep, units = np.eye(len(gain)) - gain @ s.output, np.diag(rounded - predicted) ** 2
         known = np.diag(units / np.where(units > 0, np.diag(predicted), 1.0))
         after = keep @ predicted @ keep.T + gain @ s.noise @ gain.T + known
+        whole, unit = np.diag(predicted), (len(gain) + 2) * np.finfo(float).eps
+        after += np.diag(np.where(np.diag(after) < PRECISE * whole, np.minimum(unit**2 * size, whole), 0.0))
     else:
         after = rounded - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
@@ -84,6 +89,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """
     instance("system", system, LinearSystem, "a LinearSystem")
     spread, projection, parts = system.covariance, system.projection, []
+    size = system.mean**2 + np.diag(spread)
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
     steady, transition = system.steady_from, np.eye(len(spread))
     last: tuple[np.ndarray, np.ndarray] | None = None
@@ -93,7 +99,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
                 break  # what follows is the same, to rounding
             last = spread, rounding
         s = system.step(k)
-        gain, predicted, spread = covariance_step(spread, s)
+        gain, predicted, spread = covariance_step(spread, s, size)
         keep = np.eye(len(spread)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset

@@ -9,9 +9,8 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import Steps
-from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, own_units
 from heliograph.numerics.module import readable
@@ -99,11 +98,7 @@ def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tu
 def plant_matrices(
     plant: AnyPlant, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """A and Cov(w) of a constant linear plant, for `what` needs them.
-
-    Raises:
-        ValueError: another plant.
-    """
+    """A and Cov(w) of a constant linear plant, for `what` needs them."""
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
@@ -117,11 +112,7 @@ def plant_matrices(
 def sensor_matrices(
     sensor: AnySensor, states: int, what: str = "boundedness"
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them.
-
-    Raises:
-        ValueError: another sensor.
-    """
+    """C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail(what, "a LinearSensor that does not vary", _kind(sensor))
     check_sensor(sensor, states)

@@ -7,8 +7,8 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.node import Node
 
 DEAD = 1e-3  # probability below which heartbeats are not lost one after another by chance

@@ -10,7 +10,7 @@ from .channel import (
     silent as silent,
     with_direct_link as with_direct_link,
 )
-from .clock import (
+from .enlarged import (
     Clock as Clock,
     joint_sensor as joint_sensor,
     with_clocks as with_clocks,
@@ -30,10 +30,10 @@ from .over_time import (
     over_time as over_time,
     OverTime as OverTime,
 )
-from .past import (
+from .enlarged import (
     with_past as with_past,
 )
-from .bias import (
+from .enlarged import (
     with_bias as with_bias,
 )
 from .relays import (

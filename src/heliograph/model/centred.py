@@ -8,15 +8,15 @@ import numpy as np
 
 from heliograph.model.channel import Channel, amplify_and_forward
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
+from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.combine import known
 
 
 @overload
@@ -40,10 +40,8 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    steps = steps_covered((channel, reference))
-    if steps is None:
-        return _centred(first(channel), reference)
-    return over_time([_centred(at(channel, k), at(reference, k)) for k in range(steps)])
+    result: Channel = at_each_step(_centred, channel, reference)
+    return result
 
 
 def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:

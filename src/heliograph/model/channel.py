@@ -6,18 +6,19 @@ from typing import overload
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.over_time import OverTime, over_time, unstack
-from heliograph.model.sensor import AbstractSensor, check_sensor
+from heliograph.model.over_time import OverTime, at_each_step, first, unstack
+from heliograph.model.plant import AnyPlant, check_turns
+from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, scalar
-from heliograph.numerics.traced import library
+from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, independent
-from heliograph.random_affine.combine import Mixture, Stack
-from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
+from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
 from heliograph.random_affine.erasure import Erasure
-from heliograph.random_affine.in_line import in_series
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.modes import Modes, OneStepLate
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
@@ -182,11 +183,13 @@ def mean_gain(channel: Channel) -> Channel:
     Raises:
         ValueError: a gain law that does not know its mean, a channel that remembers.
     """
-    if isinstance(channel, OverTime):
-        return over_time([mean_gain(c) for c in unstack(channel)])
-    as_maps("channel taken at its mean gain", [channel])
-    check_forgets("channel taken at its mean gain", channel)
-    return channel.mean_gain()
+
+    def mean_of(item: AbstractRandomAffine) -> AbstractRandomAffine:
+        check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [item])[0])
+        return item.mean_gain()
+
+    result: Channel = at_each_step(mean_of, channel)
+    return result
 
 
 def check_link(
@@ -212,3 +215,67 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
         outputs = len(sensor.outputs)
         expected = f"one for the sensor's {outputs} output{'s' * (outputs > 1)}, such as perfect({outputs})"
         raise fail("channel", expected, f"one that takes {sent(channel)}")
+
+
+def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
+    """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
+    start, senses = first(plant), first(sensor)
+    check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
+    steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
+    results = {carried(step, senses.angles) for step in steps}
+    if len(results) > 1:
+        raise fail("channel", "the same angles at every step", sorted(results))
+    return results.pop()
+
+
+ROUNDING = 1e-12  # of a gain of 1 that was computed
+
+
+def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
+    """Return the indices of outputs that are angles, from those of the inputs; noise and erasures leave angles."""
+    if not sent:
+        return ()
+    match channel:
+        case GainAndNoise():
+            return _through(channel, sent)
+        case Series():
+            for part in channel.maps:
+                sent = carried(part, sent)
+            return sent
+        # Outputs of parts stand one after another.
+        case Stack():
+            starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
+            items = zip(starts, channel.maps, strict=False)
+            return tuple(int(start) + i for start, part in items for i in carried(part, sent))
+        case Erasure() | OneStepLate():
+            return carried(channel.base, sent)
+        case Delayed():  # one of the angles that were sent arrives; a time stamp stands after it
+            return carried(channel.link, sent)
+        # All choices must agree.
+        case Mixture() | Modes():
+            results = {carried(part, sent) for part in channel.maps}
+            if len(results) == 1:
+                return results.pop()
+    raise _refused(type(channel).__name__)
+
+
+def _through(channel: GainAndNoise, sent: Angles) -> Angles:
+    matrix = channel.matrix
+    if is_traced(matrix):
+        raise _refused("a gain that is traced")
+    of_angles = np.asarray(matrix)[:, list(sent)]
+    touched = np.flatnonzero(np.any(of_angles != 0, axis=1))
+    if not touched.size:
+        return ()
+    if not isinstance(channel.law, Constant) or is_traced(channel.law.value):
+        raise _refused(f"a gain that is {type(channel.law).__name__}")
+    rows = float(channel.law.value) * np.asarray(matrix)[touched]
+    whole = np.abs(rows - np.round(rows)) <= ROUNDING
+    if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
+        raise _refused(f"the gains {rows[rows != 0].tolist()}")
+    return tuple(int(i) for i in touched)
+
+
+def _refused(got: str) -> ValueError:
+    expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
+    return fail("channel", expected, got)

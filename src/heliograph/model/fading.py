@@ -10,10 +10,9 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar, text
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories, with_memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
-from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.combine import GainAndNoise, Stack
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import (
     Faded,
@@ -189,7 +188,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(item) for item in unstack(channel)]
     return not harmless(steps, not isinstance(channel, OverTime))
 
 

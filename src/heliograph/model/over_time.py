@@ -1,6 +1,6 @@
 """The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -48,11 +48,7 @@ def _arrays(tree: object) -> list[PyTree]:
 
 
 def stack(items: Sequence[T]) -> T:
-    """Stack model objects of one structure into one object whose arrays have a new leading axis.
-
-    Raises:
-        ValueError: the objects differ in structure, in array shapes, or in anything that is not an array.
-    """
+    """Stack model objects of one structure into one object whose arrays have a new leading axis."""
     flat = [jax.tree.flatten(item) for item in items]
     if len({_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
@@ -124,9 +120,15 @@ def steps_covered(tree: object) -> int | None:
     return min(steps) if steps else None
 
 
-def unstack(stacked: OverTime) -> list[PyTree]:
-    """The objects of each step, as they were given to `over_time`."""
-    return [at(stacked, i) for i in range(stacked.steps)]
+def unstack(item: object) -> list[PyTree]:
+    """The objects of each step, as they were given to `over_time`; the object itself alone where it does not vary."""
+    return [at(item, i) for i in range(item.steps)] if isinstance(item, OverTime) else [item]
+
+
+def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
+    """function(*items), or an `OverTime` of its results where some item varies."""
+    steps = steps_covered(items)
+    return function(*items) if steps is None else over_time([function(*at(items, k)) for k in range(steps)])
 
 
 def first(item: object) -> PyTree:

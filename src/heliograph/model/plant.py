@@ -1,7 +1,7 @@
 """Plants: x+ = f(x, u) + w, nonlinear or linear, with a Gaussian (or other) initial state."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.of_inputs import MatrixFunction, OfInputs, matrix_of
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
@@ -25,6 +24,38 @@ from heliograph.random_affine.noise import (
     Vector,
     as_noise,
 )
+
+MatrixFunction = TypeAliasType("MatrixFunction", Callable[[jax.Array], ArrayLike])  # a matrix of the input u
+
+
+class OfInputs(Module):
+    """A matrix M(u) of the plant's inputs; whatever takes it for a constant array is refused in one line.
+
+    Args:
+        function: M, written with jax.numpy.
+        name: name of the matrix, for errors.
+        inputs: names of the inputs.
+    """
+
+    function: MatrixFunction
+    name: str = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """M(u)."""
+        return jnp.asarray(self.function(u))
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        """Raise ValueError: here the matrix must be a constant."""
+        raise fail(self.name, "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}")
+
+    __array__ = __jax_array__ = __matmul__ = __rmatmul__ = __getitem__ = __len__ = __iter__ = _refuse
+
+
+def matrix_of(matrix: object, u: jax.Array) -> jax.Array:
+    """Return a constant matrix, or the value of one that depends on inputs."""
+    return matrix(u) if isinstance(matrix, OfInputs) else jnp.asarray(matrix)
+
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
 A = TypeVar("A", jax.Array, np.ndarray)

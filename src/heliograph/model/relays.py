@@ -168,11 +168,7 @@ class Steps(Module):
 
 
 def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link.
-
-    Raises:
-        ValueError: probabilities that are uncertain.
-    """
+    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link."""
     try:
         known = link.corner_count() == 1
     except ValueError:  # too many corners to list

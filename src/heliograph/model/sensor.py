@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
@@ -15,7 +14,7 @@ from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.types import ArrayLike, Names
+from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
@@ -189,3 +188,34 @@ def refuse_angles(name: str, *parts: AnyPlant | AnySensor) -> None:
     circular = [item for part in parts for item in first(part).circular]
     if circular:
         raise fail(name, "no angles (cubature, extended, mixture and multiple model filters take them)", circular)
+
+
+def state_space(
+    F: "Float[ArrayLike, 'n n']",
+    H: "Float[ArrayLike, 'm n']",
+    Q: "NoiseLike",
+    R: "NoiseLike",
+    mean: "Float[ArrayLike, ' n']",
+    covariance: "NoiseLike",
+    B: "Float[ArrayLike, 'n inputs'] | None" = None,
+) -> tuple[LinearPlant, LinearSensor]:
+    """Return the plant x+ = F x + B u + w and the sensor z = H x + v, with Cov(w) = Q and Cov(v) = R.
+
+    `plant, sensor = hg.state_space(F, H, Q, R, mean, covariance)`, then `hg.kalman_filter(plant, sensor)`.
+
+    Args:
+        F: transition matrix.
+        H: measurement matrix.
+        Q: covariance of w, a variance for all states, or a noise law.
+        R: covariance of v, a variance for all outputs, or a noise law.
+        mean: mean of the state before the first step; the first measurement comes one step later.
+        covariance: covariance of that state, a variance for all of it, or the law of its deviation from `mean`.
+        B: input matrix; a plant without inputs unless given.
+
+    Raises:
+        ValueError: shapes that do not fit, covariances that are none, numbers that are not finite.
+    """
+    plant = LinearPlant(F, Q, mean, covariance, B)
+    sensor = LinearSensor(H, R)
+    sensor.check_states(len(plant.states))
+    return plant, sensor

@@ -7,7 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import POSITIVE, TINY, array, check_count, covariance, fail, rank, scalar, shown, tell
+from heliograph.numerics.check import (
+    POSITIVE,
+    TINY,
+    array,
+    check_count,
+    covariance,
+    fail,
+    rank,
+    report_domain,
+    scalar,
+    shown,
+)
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -290,7 +301,7 @@ class Periodic(AbstractTrigger):
 
 def threshold(delta: ArrayLike) -> Float[Array, "..."]:
     """A delta, which is positive, or one for each component."""
-    tell("delta", delta, POSITIVE)
+    report_domain("delta", delta, POSITIVE)
     result: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(result) and not np.all(result > 0):
         raise fail("delta", "a positive number, or one for each component", shown(np.asarray(result).tolist()))

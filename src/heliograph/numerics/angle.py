@@ -23,9 +23,6 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
         name: what an error calls the list.
         circular: names of angles.
         names: all names, in the order of the components.
-
-    Raises:
-        ValueError: an unknown name, or a name listed twice.
     """
     given = [str(item) for item in items(name, circular, "names")]
     unknown = [item for item in given if item not in names]

@@ -39,7 +39,7 @@ def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
     return result
 
 
-def tell(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
+def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
     """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
     if isinstance(value, Marked):
         if value.report is not None:
@@ -47,17 +47,17 @@ def tell(name: str, value: object, whole: Domain, entry: Domain | None = None) -
     elif isinstance(value, list | tuple):
         for item in value:
             if isinstance(item, Marked | list | tuple):
-                tell(name, item, whole if entry is None else entry, entry)
+                report_domain(name, item, whole if entry is None else entry, entry)
 
 
-def tell_covariance(name: str, value: object) -> None:
+def report_covariance(name: str, value: object) -> None:
     """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
     if isinstance(value, Marked):
-        tell(name, value, COVARIANCE if value.ndim else POSITIVE)
+        report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
         for i, row in enumerate(value):
             for j, item in enumerate(row if isinstance(row, list | tuple) else []):
-                tell(name, item, POSITIVE if i == j else REAL)
+                report_domain(name, item, POSITIVE if i == j else REAL)
 
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
@@ -102,7 +102,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
     shape alone is checked.
     """
-    tell(name, value, REAL)
+    report_domain(name, value, REAL)
     result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
         not isinstance(projection, int) or projection == have
@@ -146,7 +146,7 @@ def _numbers(name: str, value: ArrayLike) -> Any:
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
     """Return `value` as a finite scalar between `low` and `high`."""
-    tell(name, value, Domain(low=low, high=high))
+    report_domain(name, value, Domain(low=low, high=high))
     result = array(name, value, ())
     if not is_traced(result) and not low <= result <= high:
         raise fail(name, _range_words(low, high), f"{float(result):g}")
@@ -283,12 +283,8 @@ def backwards_text(clock: np.ndarray, row: int) -> str:
 
 
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
-    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity.
-
-    Raises:
-        ValueError: wrong shape, not finite, not symmetric, or with a negative eigenvalue.
-    """
-    tell_covariance(name, value)
+    """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
+    report_covariance(name, value)
     result = _numbers(name, value)
     # A scalar c stands for c I.
     if dimension is not None and result.ndim == 0:
@@ -322,7 +318,7 @@ def own_units(matrix: np.ndarray) -> np.ndarray:
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
     """Return non-negative numbers that sum to one."""
-    tell(name, value, SIMPLEX, PROBABILITY)
+    report_domain(name, value, SIMPLEX, PROBABILITY)
     result = array(name, value, (count,))
     if is_traced(result):
         return result

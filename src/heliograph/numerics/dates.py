@@ -24,11 +24,7 @@ def looks_like_date(text: str) -> bool:
 
 
 def dates(texts: Iterable[object], name: str) -> np.ndarray:
-    """Dates of ISO 8601 as datetime64[ns] in UTC; empty is NaT. Without a zone they are taken as they stand, as UTC.
-
-    Raises:
-        ValueError: a text that is no date; some with a zone and some without; one line that names the row, from 1.
-    """
+    """Dates of ISO 8601 as datetime64[ns] in UTC; empty is NaT. Without a zone they are taken as they stand, as UTC."""
     results, zones = [], set()
     for row, element in enumerate(texts, 1):
         text = element.isoformat() if hasattr(element, "isoformat") else "" if element is None else str(element).strip()
@@ -68,11 +64,7 @@ def _instant(match: re.Match[str]) -> int:
 
 
 def instant(text: str) -> datetime:
-    """A date of ISO 8601 with its zone, to the microsecond.
-
-    Raises:
-        ValueError: a text that is none, one without a zone, a year before 1678 or after 2261.
-    """
+    """A date of ISO 8601 with its zone, to the microsecond."""
     match = DATE.fullmatch(text)
     if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
         raise ValueError

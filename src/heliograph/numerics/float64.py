@@ -17,11 +17,7 @@ _first: list[int] = []  # the process in which something was computed first; a f
 
 
 def check_process() -> None:
-    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process.
-
-    Raises:
-        ValueError: such a fork; processes that are started anew ("spawn") know nothing of it.
-    """
+    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process."""
     here = os.getpid()
     if not _first:
         _first.append(here)

@@ -11,10 +11,9 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import sequential_vmap
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Float
 
 from heliograph.numerics.over_runs import runs_last, runs_last_of
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, Float
 
 UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
 PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero

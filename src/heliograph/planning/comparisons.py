@@ -14,8 +14,8 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign
 from heliograph.planning.transmitters import Hop, Signal, transmitter_names, visit_hops
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import GainAndNoise
 from heliograph.random_affine.law import GivenMoments
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

@@ -18,10 +18,13 @@ from heliograph.planning.paths.networks import paths_of
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.realised import BEST, COVERED
 from heliograph.planning.transmitters import selected
-from heliograph.relays.design import given_design, relay_schedules
-from heliograph.relays.periodic import periodic_behind_relays, periodic_given_design, periodic_own_error_design
-from heliograph.relays.periodic_tuning import periodic_relays_for_best_receiver
-from heliograph.relays.receiver import receiver_behind_relays
+from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
+from heliograph.relays.periodic import (
+    periodic_behind_relays,
+    periodic_given_design,
+    periodic_own_error_design,
+    periodic_relays_for_best_receiver,
+)
 from heliograph.simulation.network import Network
 
 

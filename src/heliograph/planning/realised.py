@@ -70,8 +70,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         covered = min((sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)), default=1)
         joint = _over_time([_joined({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
         fused = {BEST: linear_filter(plant, joint, _over_time([parallel(list(step.values())) for step in steps]))}
-    result = Network(plant, designed, fused)
-    return repeated(result) if error.period > 1 else result
+    realised = Network(plant, designed, fused)
+    return repeated(realised) if error.period > 1 else realised
 
 
 def repeated(network: Network) -> Network:

@@ -16,10 +16,9 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant

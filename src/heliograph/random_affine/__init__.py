@@ -1,6 +1,6 @@
 """The algebra of random affine maps z = G y + n: sampling and joint moments of one object.
 
-Knows nothing of filters or networks. Start with `base`, then `atoms` and `combine`; filters read `second_order`."""
+Knows nothing of filters or networks. Start with `base`, then `combine`; filters read `second_order`."""
 
 from heliograph.numerics.names import lazy_names
 

@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .atoms import (
+from .combine import (
     GainAndNoise as GainAndNoise,
     known as known,
 )

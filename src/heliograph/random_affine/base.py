@@ -7,13 +7,13 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import fail, items, shown
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, stacked
+from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import Moments
 
 T = TypeVar("T")
 
@@ -262,21 +262,13 @@ def advance(
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity in order of appearance.
-
-    Raises:
-        ValueError: one name for memories that differ.
-    """
+    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
     parts = jax.tree.leaves(channel, is_leaf=_is_modal)
     return distinct(part.memory for part in parts if _is_modal(part))
 
 
 def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Memories by what tells them apart, in order of appearance.
-
-    Raises:
-        ValueError: one name for memories that differ.
-    """
+    """Memories by what tells them apart, in order of appearance."""
     results: dict[str, AbstractMemory] = {}
     for memory in held:
         known = results.setdefault(memory.identity, memory)

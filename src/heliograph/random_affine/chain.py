@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
 from heliograph.numerics.check import (
@@ -22,12 +21,12 @@ from heliograph.numerics.check import (
     fail,
     probabilities,
     radii,
+    report_domain,
     scalar,
-    tell,
 )
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]
@@ -124,7 +123,7 @@ class MarkovChain(AbstractMemory):
         name: str | None = None,
         radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
-        tell("transition matrix", transition, SIMPLEX, PROBABILITY)
+        report_domain("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
         if rows.shape[0] != rows.shape[1] or not rows.size:
             raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")
@@ -223,11 +222,7 @@ class Autoregression(AbstractMemory):
 
 
 def stationary(transition: Rows) -> Law:
-    """The law p = p Pi of a chain that has only one.
-
-    Raises:
-        ValueError: more than one.
-    """
+    """The law p = p Pi of a chain that has only one."""
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:

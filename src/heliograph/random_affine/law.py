@@ -11,7 +11,6 @@ from math import gamma
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
@@ -19,7 +18,7 @@ from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 Scalar = Float[jax.Array | np.ndarray, ""]
 Vector = Float[jax.Array | np.ndarray, " n"]

@@ -9,13 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
 
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stacked
-from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.atoms import GainAndNoise, known
+from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractModal,
     AbstractOfOneShape,
@@ -27,10 +25,10 @@ from heliograph.random_affine.base import (
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.combine import Mixture, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.lift import Lift
-from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
@@ -269,9 +267,6 @@ def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """The channel with its modes drawn anew at each step, by their law in the long run; moments up to order 4 are kept.
 
     A channel without memory is itself.
-
-    Raises:
-        ValueError: a map inside that remembers in a way of its own.
     """
     if not channel.remembers:
         return channel

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics import check
@@ -15,7 +14,7 @@ from heliograph.numerics.check import array, fail, instance, items, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
 OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -227,11 +226,7 @@ NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a co
 
 
 def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
-    """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise.
-
-    Raises:
-        ValueError: not a covariance, or a law of another dimension.
-    """
+    """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise."""
     if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)

@@ -8,12 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
 
 from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
 

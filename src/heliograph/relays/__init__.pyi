@@ -11,11 +11,11 @@ from .periodic import (
     periodic_given_design as periodic_given_design,
     periodic_own_error_design as periodic_own_error_design,
 )
-from .periodic_tuning import (
+from .periodic import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
 )
-from .receiver import (
+from .design import (
     receiver_behind_relays as receiver_behind_relays,
     receiver_system as receiver_system,
 )

@@ -1,5 +1,6 @@
 """Relays and receiver tuned together, over a horizon, so that the receiver's error is small; power may be bounded."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -7,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.relays import RelayNetwork, Steps
-from heliograph.numerics.check import array, check_count, fail, instance
+from heliograph.numerics.check import array, check_count, fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
+from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
     RelayDesign,
     given_design,
@@ -19,8 +21,181 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.power_limit import Limited, best_within, power_limit_of
-from heliograph.relays.second_moments import best_gain, correct, propagate, pull_back, step_moments
+from heliograph.relays.second_moments import (
+    best_gain,
+    correct,
+    gain_mask,
+    normal_matrix,
+    propagate,
+    pull_back,
+    step_moments,
+)
+
+POWER_TOLERANCE = 1e-6  # relative excess over a limit that counts as met
+BARRIERS = np.geomspace(1e-1, 1e-4, 32)  # of the cost at the start, for all steps together
+ROOM = 0.1  # part of each limit that the first gains leave free
+HALVINGS = 30
+DAMPING = 1e-6  # relative, of the normal matrices that scale the gains
+MEMORY = 30  # updates that stand for the inverse Hessian of all steps' gains
+PRECISION = 1e-8  # of the cost at the start: five iterations in a row that gain less end a descent
+
+
+class PowerLimit(NamedTuple):
+    """Each step's gains must keep <form_k, moments after the step> below limit_k: the power of the next step.
+
+    Both without the power of the mean state, which every unbiased estimate sends; a step before silence has form 0.
+    """
+
+    form: Float[Array, "*time d d"]
+    limit: Float[Array, "*time"]
+
+
+class Limited(NamedTuple):
+    """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
+
+    steps: Steps
+    start: Float[Array, "d d"]
+    cost: Float[Array, "time d d"]
+    power: PowerLimit
+
+
+def power_limit_of(steps: Steps, value: ArrayLike, d: int) -> PowerLimit:
+    """The limit on the moments after each step, from one on the power that all relays send at each step."""
+    horizon = len(steps.live)
+    limit = per_step("power limit", value, horizon) * (1 + POWER_TOLERANCE)
+    mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
+    talkers = steps.talks[:, 1:].sum(axis=1)
+    fixed = mean_signal * talkers  # estimates are unbiased: E s = E x
+    low = np.flatnonzero((limit <= fixed) & (talkers > 0))
+    if len(low):
+        step = int(low[0])
+        text = f"more than {fixed[step]:.6g} at step {step}, the power of the mean state"
+        raise fail("power limit", text, limit[step] / (1 + POWER_TOLERANCE))
+    forms = power_forms(steps, d)
+    left = np.where(talkers > 0, limit - fixed, 1.0)
+    return PowerLimit(np.concatenate([forms[1:], np.zeros((1, d, d))]), np.append(left[1:], 1.0))
+
+
+def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
+    """Matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
+    time, n = steps.state_mean.shape
+    forms = np.zeros((time, d, d))
+    for r in range(len(steps.received) - 1):
+        s = np.zeros((n, d))
+        s[:, :n], s[:, (1 + r) * n : (2 + r) * n] = np.eye(n), -np.eye(n)  # s_r = x - e_r
+        sent = steps.sensing @ s
+        forms += np.swapaxes(sent, 1, 2) @ sent * steps.talks[:, 1 + r, None, None]
+    return forms
+
+
+def best_within(
+    problem: Limited, local: Float[np.ndarray, "time Fn R"], iterations: int
+) -> Float[np.ndarray, "time Fn R"]:
+    """Gains of small cost that meet the limit; never dearer than `local`, if those meet it.
+
+    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local`, over the gains of all steps at
+    once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that happens
+    to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
+    """
+    whole = float(_judge(problem, local)[0])
+    problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
+    results = [local, _inside(problem, local)]
+    for barrier in BARRIERS / len(local):
+        gains = results[-1]
+        units = np.asarray(_units(problem, gains, barrier))
+        function = partial(_descended, problem, gains, units, barrier)
+        x = bfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION, MEMORY)
+        results.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
+    judged = [_judge(problem, gains) for gains in results]
+    costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        raise fail("power limit", "one that some design meets", "one for which none was found")
+    return results[best]
+
+
+def _inside(problem: Limited, local: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
+    """`local` with the relays' gains smaller by one factor, so that ROOM is left; without gains all of it is."""
+    relays = local.shape[1] - problem.steps.transition.shape[-1]
+
+    def smaller(factor: float) -> np.ndarray:
+        return np.concatenate([factor * local[:, :relays], local[:, relays:]], axis=1)
+
+    low, high = 0.0, 2.0  # the first half is 1, the gains as they are
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        if np.min(_judge(problem, smaller(middle))[1]) < ROOM:
+            high = middle
+        elif middle == 1.0:
+            return local
+        else:
+            low = middle
+    return smaller(low)
+
+
+@compiled
+def _judge(problem: Limited, gains: Float[Array, "time Fn R"]) -> tuple[Float[Array, ""], Float[Array, "time"]]:
+    """The cost of given gains, and the part of each limit that they leave free."""
+    moments = propagate(problem.steps, problem.start, gains).moments[1:]
+    form, limit = problem.power
+    return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
+
+
+@compiled
+def _moved(
+    gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: Steps
+) -> Float[Array, "time Fn R"]:
+    """Gains changed by x in given units."""
+    rows, columns = np.nonzero(gain_mask(steps))
+    return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
+
+
+@compiled
+def _barrier(
+    problem: Limited, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
+) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
+    """Cost and barrier at gains moved by x, infinite outside, and its gradient."""
+
+    def value(x: jax.Array) -> jax.Array:
+        cost, slack = _judge(problem, _moved(gains, units, x, problem.steps))
+        inside = jnp.all(slack > 0)
+        logarithms = jnp.log(jnp.where(inside, slack, 1.0))
+        return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
+
+    result: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
+    return result
+
+
+def _descended(
+    problem: Limited, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
+) -> tuple[float, Float[np.ndarray, "variables"]]:
+    """`_barrier` of all variables in one vector."""
+    value, gradient = _barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
+    return float(value), np.asarray(gradient).ravel()
+
+
+@compiled
+def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -> Float[Array, "time r r"]:
+    """L'^-1 for each step, L L' the normal matrix of its gains: in these units the cost curves alike in all directions.
+
+    The gradient with respect to moments, cost and barrier, is pulled back step by step.
+    """
+    steps, start, cost, (form, limit) = problem
+    moments = jnp.asarray(propagate(steps, start, gains).moments)
+    slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
+    slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
+
+    def back(ahead: jax.Array, item: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        p, gain, before, slope_k = item
+        ahead = ahead + slope_k
+        normal, _ = normal_matrix(step_moments(p, before)[0], ahead, p, DAMPING)
+        free = jnp.asarray(p.live)[np.nonzero(gain_mask(p))[1]]
+        unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(normal).T, jnp.diag(free))
+        return pull_back(p, gain, ahead), free[:, None] * unit
+
+    items = (steps, jnp.asarray(gains), moments[:-1], slope)
+    return jax.lax.scan(back, jnp.zeros_like(jnp.asarray(start)), items, reverse=True)[1]
+
 
 STEPS = 4  # of a descent within a power limit, for each sweep
 

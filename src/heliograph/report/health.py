@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import STRENGTH
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
-from heliograph.simulation.network import Network, claim_at
+from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
@@ -118,9 +116,9 @@ def examine(
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
-    filters, outputs, relied_on = [], [], _relied_on(network)
+    filters, outputs = [], []
     for listener in listeners(network, record):
-        node, name, item, z, _ = listener
+        node, name, item, z = listener[:4]
         advance(f"testing {node}/{name}")
         white = None
         if item.claim != "none" and item.received:
@@ -130,20 +128,5 @@ def examine(
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
-        trusted = name in relied_on.get(node, {name})
-        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test, trusted))
+        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test, listener.trusted))
     return Health(record, links, filters, outputs, network.shared)
-
-
-def _relied_on(network: Network) -> dict[str, set[str]]:
-    """Return the filters that the network relies on, by node: fused ones, else the first of the strongest claim.
-
-    Others, such as one that takes the mean of a random gain for it, are there to be compared with.
-    """
-    fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
-    results = {}
-    for node, place in network.nodes.items():
-        claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
-        strongest = [name for name, s in claims.items() if s == max(claims.values())]
-        results[node] = fused & set(claims) or set(strongest[:1])
-    return results

@@ -10,52 +10,76 @@ import numpy as np
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
-from heliograph.model.estimate import Innovation
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import STRENGTH, Innovation
 from heliograph.report.results import Json
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
 
 
 class OutputHealth(NamedTuple):
     """Innovations of one received number under one filter.
 
-    weighs: whether the filter weighs what arrives. outlying: whether more of its values are down-weighted than of the
-    filter's others together, by an interval of the difference.
+    weighs: whether the filter weighs what arrives. to_blame: whether more of its values are down-weighted than of the
+    filter's others together, by an interval of the difference, and the filter is one that the network relies on where
+    any of these weighs.
     """
 
     node: str
     filter: str
     output: str
     weighs: bool
-    outlying: bool
+    to_blame: bool
     summary: InnovationSummary
 
     def __str__(self) -> str:
         """One line, such as "radio/robust: left: 7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
-        blame = "; to blame: more than of the others" if self.outlying else ""
+        blame = "; to blame: more than of the others" if self.to_blame else ""
         return visible(f"{self.node}/{self.filter}: {self.output}: {self.summary}{blame}")
 
 
 class Listener(NamedTuple):
-    """A filter with its measurements (time, m) and their names."""
+    """A filter with its measurements (time, m) and their names.
+
+    trusted: whether the network relies on it. blames: whether its weights say which output is to blame.
+    """
 
     node: str
     name: str
     filter: AbstractFilter
     measurements: np.ndarray
     outputs: list[str]
+    trusted: bool = True
+    blames: bool = True
 
 
 def listeners(network: Network, record: Record) -> Iterator[Listener]:
     """Yield every filter with its measurements: those of the nodes, then central ones."""
-    received = record.measurements
+    received, relied_on = record.measurements, _relied_on(network)
     for node, z in received.items():
-        for name, item in network.nodes[node].filters.items():
-            yield Listener(node, name, item, z, list(network.nodes[node].received_names))
+        filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
+        weighing = {name for name, item in filters.items() if item.received and weighs(item)}
+        blaming = weighing & relied_on[node] or weighing
+        for name, item in filters.items():
+            yield Listener(node, name, item, z, names, name in relied_on[node], name in blaming)
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
             yield Listener(FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
+
+
+def _relied_on(network: Network) -> dict[str, set[str]]:
+    """Return the filters that the network relies on, by node: fused ones, else the first of the strongest claim.
+
+    Others, such as one that takes the mean of a random gain for it, are there to be compared with.
+    """
+    fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
+    results = {}
+    for node, place in network.nodes.items():
+        claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
+        strongest = [name for name, s in claims.items() if s == max(claims.values())]
+        results[node] = fused & set(claims) or set(strongest[:1])
+    return results
 
 
 def weighs(item: AbstractFilter) -> bool:
@@ -73,7 +97,9 @@ def outputs_of(listener: Listener, inputs: np.ndarray) -> list[OutputHealth]:
     summaries = summarise_innovations(innovation)
     outliers, weighed = outlying(summaries), result.weights is not None
     return [
-        OutputHealth(listener.node, listener.name, name, weighed, weighed and i in outliers, summary)
+        OutputHealth(
+            listener.node, listener.name, name, weighed, weighed and listener.blames and i in outliers, summary
+        )
         for i, (name, summary) in enumerate(zip(listener.outputs, summaries, strict=True))
     ]
 
@@ -94,5 +120,5 @@ def output_numbers(item: OutputHealth) -> dict[str, Json]:
                    "share_high": summary.share.high}  # fmt: skip
     counted: dict[str, Json] = {"expected": summary.expected, "received": summary.received}
     if item.weighs:
-        counted |= {"down_weighted": summary.down_weighted, "to_blame": item.outlying}
+        counted |= {"down_weighted": summary.down_weighted, "to_blame": item.to_blame}
     return counted | {name: None if np.isnan(value) else value for name, value in values.items()}

@@ -109,6 +109,16 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """Pictures of which one is shown, chosen from a list by its name; all of them in print and where no script runs."""
+
+    label: str
+    names: Sequence[str]
+    pictures: Sequence[Picture]
+    kind: str = "choice"
+
+
+@dataclass(frozen=True)
 class Code:
     """Lines to type or to read."""
 
@@ -116,7 +126,7 @@ class Code:
     kind: str = "code"
 
 
-Block = Text | Points | KeyFigures | Table | Statements | Picture | Code
+Block = Text | Points | KeyFigures | Table | Statements | Picture | Choice | Code
 
 
 @dataclass(frozen=True)
@@ -137,6 +147,11 @@ class Page:
     lead: str
     sections: Sequence[Section]
     footer: str = ""
+
+    @property
+    def has_choice(self) -> bool:
+        """Test whether something is chosen from a list, which takes a script."""
+        return any(block.kind == "choice" for section in self.sections for block in section.blocks)
 
     def html(self) -> str:
         """Return the page as HTML that loads nothing else."""

@@ -100,7 +100,7 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
     with _bar(*columns) as bar:
         task = bar.add_task("starting", total=1, left="")
 
-        def tell(what: str, done: int, total: int) -> None:
+        def show(what: str, done: int, total: int) -> None:
             nonlocal said
             # Remaining time, once the countdown has a first piece.
             left = "" if countdown.first is None else spoken(countdown.left(total))
@@ -109,7 +109,7 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
                 said = time.monotonic()
                 print(f"{what}: {done} of {total}{left and ', '}{left}", file=sys.stderr)
 
-        yield tell
+        yield show
 
 
 @contextmanager
@@ -117,10 +117,10 @@ def show_progress(what: str = "simulating") -> Iterator[Callable[[int, int], Non
     """Show a progress bar with the time left, for `monte_carlo(..., progress=...)`."""
     countdown = Countdown()
     countdown.note(0)
-    with counting(countdown) as tell:
+    with counting(countdown) as show:
 
         def progressed(done: int, total: int) -> None:
             countdown.note(done)
-            tell(what, done, total)
+            show(what, done, total)
 
         yield progressed

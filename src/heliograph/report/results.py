@@ -39,7 +39,11 @@ class Results:
 
 
 def write_results(
-    target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
+    target: Path,
+    stages: int,
+    compute: Callable[[Advance], T],
+    results_of: Callable[[T], Results],
+    needs: Sequence[str] = (),
 ) -> T:
     """Compute, then write figures, report, data and summary to `target`.
 
@@ -50,7 +54,7 @@ def write_results(
         target: the folder of results.
         stages: number of stages of the computation, for the progress bar.
         compute: the computation, called with the callback that announces a stage.
-        tell: function from what was computed to its results.
+        results_of: function from what was computed to its results.
         needs: packages of extras that are needed in addition to those of `report`.
 
     Returns:
@@ -66,7 +70,7 @@ def write_results(
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         result = compute(advance)
         advance("drawing and writing")
-        _write(tell(result), folder)
+        _write(results_of(result), folder)
     return result
 
 

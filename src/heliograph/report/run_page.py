@@ -14,13 +14,14 @@ from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import output_numbers
-from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
-MOST = 8  # nodes, filters and links that are drawn; tables and summary hold all
+FEW = 8  # pictures one below the other; of more, one is chosen from a list
+MOST = 64  # nodes and links that are drawn; tables and summary hold all
 BAND = 2.0  # deviations
 LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
 
@@ -32,16 +33,19 @@ def run_results(health: Health, network: str) -> Results:
 
 def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
-    drawn = {f"estimates_{i}": _estimates(health, health.record, node) for i, node in enumerate(_nodes(health.record))}
-    later = health.record.smoothed
-    if later is not None:
-        drawn |= {f"smoothed_{i}": _estimates(health, later, node) for i, node in enumerate(_nodes(later))}
-    tested = _tested(health)
-    if tested:
-        drawn["innovations"] = _innovations(health, tested)
+    drawn: dict[str, Figure] = {}
+    for kind, record in _estimated(health):
+        drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
+    drawn |= {name: _innovations(health, tested) for name, tested in _tested(health).items()}
     if health.links:
         drawn["links"] = _links(health)
     return drawn
+
+
+def _estimated(health: Health) -> list[tuple[str, Record]]:
+    """Return the filtered estimates, and the smoothed ones if there are any, by kind."""
+    later = health.record.smoothed
+    return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
 
 def _nodes(record: Record) -> list[str]:
@@ -53,13 +57,24 @@ def _ordered(record: Record) -> list[str]:
     return sorted((node for node, filters in record.estimates.items() if filters), key=lambda node: node != FUSED)
 
 
-def _tested(health: Health) -> list[FilterHealth]:
-    return _testable(health)[:MOST]
+def _tested(health: Health) -> dict[str, list[FilterHealth]]:
+    """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
+    tested = sorted((item for item in health.filters if item.white is not None), key=lambda item: item.node != FUSED)
+    if len(tested) <= FEW:
+        return {"innovations": tested} if tested else {}
+    nodes: dict[str, list[FilterHealth]] = {}
+    for item in tested:
+        nodes.setdefault(item.node, []).append(item)
+    return {f"innovations_{i}": filters for i, filters in enumerate(list(nodes.values())[:MOST])}
 
 
-def _testable(health: Health) -> list[FilterHealth]:
-    tested = (item for item in health.filters if item.white is not None)
-    return sorted(tested, key=lambda item: item.node != FUSED)
+def _chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
+    """Return pictures by node one below the other, or as a choice where there are many."""
+    return (
+        [*pictures.values()]
+        if len(pictures) <= FEW
+        else [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
+    )
 
 
 def _not_drawn(names: Sequence[str], where: str) -> list[Text]:
@@ -86,9 +101,12 @@ def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     names = _components(health)
     for axes, item in zip(grid, tested, strict=True):
         white = np.asarray(item.white)
+        # A colour for each output; of more outputs than colours, such as a centre's, one for all.
+        alike = white.shape[1] > len(COLOURS)
         for i, component in enumerate(white.T):
-            name, colour = names[item.node][i], COLOURS[i % len(COLOURS)]
-            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=in_figure(name))
+            name, colour = ("outputs", BLUE) if alike else (names[item.node][i], COLOURS[i])
+            label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
+            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
         axes.set_title(in_figure(f"{item.node}/{item.filter}"))
@@ -108,7 +126,7 @@ def _components(health: Health) -> dict[str, list[str]]:
 
 @matplotlib.rc_context(LOOK)
 def _links(health: Health) -> Figure:
-    links = health.links[: 3 * MOST]
+    links = health.links[:MOST]
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
     for row, link in enumerate(links):
@@ -142,12 +160,15 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     # Filtered estimates, then smoothed ones if there are any.
-    estimates = [
-        Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
-                f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each side{added}.")
-        for kind, item, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
-        for i, node in enumerate([] if item is None else _nodes(item))
-    ]  # fmt: skip
+    estimates: list[Picture | Choice] = []
+    for kind, item in _estimated(health):
+        added = ", given later data too" if kind == "smoothed" else ""
+        estimates += _chosen({
+            node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
+                          f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
+                          f"side{added}.")
+            for i, node in enumerate(_nodes(item))
+        })  # fmt: skip
     # Warnings are in the title and in the first section.
     return Page(
         kicker="Heliograph run",
@@ -231,7 +252,7 @@ def _compared(health: Health) -> list[Text | Points]:
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
+def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture | Choice]:
     # One row for each filter: size, correlation and p-value of its innovations.
     rows = []
     for tested_filter in health.filters:
@@ -257,13 +278,19 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     )
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
     # The innovations themselves, if any filter has some.
-    picture = [Picture(drawings["innovations"], "Innovations over time in claimed deviations",
-                       f"Innovations in claimed standard deviations, one colour an output; 5 of 100 may lie beyond "
-                       f"±{BAND:g}.")
-               ] if "innovations" in drawings else []  # fmt: skip
-    left = [f"{item.node}/{item.filter}" for item in _testable(health)[MOST:]]
+    tested = _tested(health)
+    pictures = {
+        filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
+                                 f"Innovations in claimed standard deviations, one colour an output (of more than "
+                                 f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
+        for name, filters in tested.items()
+    }  # fmt: skip
+    drawn = {item.node for filters in tested.values() for item in filters}
+    left = [
+        f"{item.node}/{item.filter}" for item in health.filters if item.white is not None and item.node not in drawn
+    ]
     table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
-    return [Text([text]), table, *picture, *_not_drawn(left, "Their numbers are in the table.")]
+    return [Text([text]), table, *_chosen(pictures), *_not_drawn(left, "Their numbers are in the table.")]
 
 
 def outputs_table(health: Health) -> list[Table]:
@@ -277,7 +304,7 @@ def outputs_table(health: Health) -> list[Table]:
         name = visible(f"{item.node}/{item.filter}: {item.output}")
         bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
         rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
-                     "to blame" if item.outlying else ""])  # fmt: skip
+                     "to blame" if item.to_blame else ""])  # fmt: skip
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
@@ -299,7 +326,7 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
     caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
-    left = [f"{link.node}: {link.component}" for link in health.links[3 * MOST :]]
+    left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
     not_drawn = _not_drawn(left, "Their numbers are in the table.")
     return [Table(headers, rows), *picture, *not_drawn, *shared_text(health.shared)]
 

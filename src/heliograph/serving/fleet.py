@@ -12,7 +12,7 @@ from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
-from heliograph.numerics.check import check_count, fail, instance, scalar
+from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
@@ -29,12 +29,14 @@ class Options(NamedTuple):
         ahead: how much later than its arrival the time of an event may be (default 0).
         leap: how much later than the newest arrival so far the time of an event may be (default unlimited).
         capacity: greatest number of rows held for each plant (default 1000).
+        step: seconds of a step, where time counts steps and messages carry dates; None where they carry steps.
     """
 
     window: float = 10.0
     ahead: float = 0.0
     leap: float = np.inf
     capacity: int = 1000
+    step: float | None = None
 
 
 class Finalised(NamedTuple):
@@ -173,7 +175,9 @@ class Fleet:
         """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
         final, now = int(np.ceil(plant.now - self.options.window)) - 1, int(np.floor(min(plant.now, self._end)))
         links = {name: plant.links.get(name) for name in self.deciding}
-        last = {name: int(link.at) if link is not None and link.used else None for name, link in links.items()}
+        last = {
+            name: int(link.latest) if link is not None and link.latest >= 0 else None for name, link in links.items()
+        }
         return {name: sender_status(node, last[name], final, now) for name, node in self.deciding.items()}
 
     def forget(self, finalised: Iterable[Finalised]) -> None:
@@ -183,9 +187,10 @@ class Fleet:
 
 
 def _checked(options: Options) -> Options:
+    step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))
-    return Options(window, ahead, float(leap), check_count("capacity", options.capacity))
+    return Options(window, ahead, float(leap), check_count("capacity", options.capacity), step)
 
 
 Round = tuple[list[int], list[int], list[float]]  # slots to step from, slots to step into, and the number of the step

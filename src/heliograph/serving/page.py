@@ -39,6 +39,7 @@ class Tallies(Collector):
         """Yield the current metrics."""
         yield from _links(self.watch)
         yield from _nis(self.watch)
+        yield _fused(self.watch)
         yield _dead(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
         malformed = sum(service.malformed for service in self.watch.services)
@@ -69,6 +70,14 @@ def _dead(watch: Watch) -> Metric:
     for node, count in watch.dead_senders().items():
         dead.add_metric([node], count)
     return dead
+
+
+def _fused(watch: Watch) -> Metric:
+    what = "1 if a filter whose estimates a fusion takes is doubted: a fusion of estimates has no innovation."
+    doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
+    for row in watch.fused_rows(watch.nis):
+        doubted.add_metric([str(row["filter"])], float(bool(row["doubt"])))
+    return doubted
 
 
 def _nis(watch: Watch) -> Iterable[Metric]:

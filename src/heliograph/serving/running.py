@@ -25,6 +25,7 @@ from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing
 LISTED = 10  # damaged plants in one line
+SHORTEST = 1.0  # seconds without messages after which their silence is used
 
 
 @dataclass(frozen=True)
@@ -132,15 +133,16 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
     # The store first, whose state the service goes on from.
     stop = asyncio.Event()
-    fleet = Fleet(lanes, settings.options)
+    reads = None if settings.sources is None else Translator(settings.sources, settings.network)
+    step = None if reads is None else reads.sources.step
+    fleet = Fleet(lanes, settings.options._replace(step=step))
     store = _open_store(settings, fleet)
     resumed, service = store.count() > 0, Service(fleet, store, _say)
     try:
         with signals(stop):
-            reads = None if settings.sources is None else Translator(settings.sources, settings.network)
             broker = settings.broker
             transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
-            await serve_until(stop, look(service), transport)
+            await serve_until(stop, look(service), transport, None if step is None else max(step, SHORTEST))
     finally:
         store.close()
     # What was not used, in words.

@@ -265,13 +265,13 @@ class Watch:
                 "points": [point._asdict() for point in points],
                 "links": _added(results),
                 "senders": senders,
-                "tests": [_test_row(*key, test) for key, test in tests.items()] + self._fused_rows(tests),
+                "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
                 "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": _added(item for _, item in self.plants()),
             }
 
-    def _fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
+    def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
         """Return the check of each fusion of estimates, by the claims of what it fuses."""
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():

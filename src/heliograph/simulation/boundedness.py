@@ -27,8 +27,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

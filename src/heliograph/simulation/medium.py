@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.gaussian_sum import EventFilter
@@ -22,6 +21,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
@@ -304,23 +304,23 @@ def medium_of(network: Network) -> AbstractMedium:
     # A sensor and a channel for each node, stacked by group.
     groups: list[NodeGroup | Silent] = []
     places = network.places()
-    local = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    memories = memory_places({name: node.channel for name, node in local.items()})
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    memories = memory_places({name: node.channel for name, node in nodes.items()})
     for names in network.groups:
-        if names[0] not in local:
+        if names[0] not in nodes:
             groups.append(Silent(len(names)))
             continue
-        parts = stack([(local[name].sensor, _unnamed(local[name].channel, memories[name])) for name in names])
+        stacked = stack([(nodes[name].sensor, _unnamed(nodes[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
-        held = np.stack([memories[name] for name in names])
-        informed_by = local[names[0]].informed_by or local[names[0]].predictor
+        memory_rows = np.stack([memories[name] for name in names])
+        informed_by = nodes[names[0]].informed_by or nodes[names[0]].predictor
         reference_filter: PyTree = (
-            None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+            None if informed_by is None else stack([nodes[name].filters[informed_by] for name in names])
         )
         place = None if informed_by is None else places[names[0], informed_by][:2]
-        triggers: PyTree = [local[name].trigger for name in names]
+        triggers: PyTree = [nodes[name].trigger for name in names]
         trigger = None if triggers[0] is None else stack(triggers)
-        groups.append(NodeGroup(*parts, checksums, held, reference_filter, trigger, place))
+        groups.append(NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, place))
     return SeparateChannels(tuple(groups))
 
 

@@ -13,8 +13,7 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.system import Schedule
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import computed
 from heliograph.numerics.check import array, check_times, fail, instance, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
@@ -88,18 +87,19 @@ def run(
                 stacklevel=2,
             )
     # Filters, and what became of the reports.
-    part = None if smooth is None else smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, part and part.kinds, judges=True)
+    smoothing = None if smooth is None else smoothed_part(network, smooth, steps)
+    filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
     with jax.enable_x64(True):
-        given = {} if reports is None else table("reports", reports, "reports by fusion")
+        recorded_reports = {} if reports is None else table("reports", reports, "reports by fusion")
         arrivals: dict[str, PyTree] = {
-            name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
+            name: item.uplinks.recorded(name, item.nodes, recorded_reports.get(name), steps)
             for name, item in filters.reporting.items()
         } | {
-            name: mesh.edges.recorded(name, mesh.nodes, given.get(name), steps) for name, mesh in filters.meshes.items()
+            name: mesh.edges.recorded(name, mesh.nodes, recorded_reports.get(name), steps)
+            for name, mesh in filters.meshes.items()
         }
-        result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
-    record = found_record(network, part, result, clock)
+        outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
+    record = found_record(network, smoothing, outputs, clock)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 

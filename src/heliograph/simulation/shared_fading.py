@@ -6,10 +6,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories
 from heliograph.random_affine.delay import sent
 from heliograph.simulation.draws import (

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, Reason
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
 
 
 class StepOutput(NamedTuple):

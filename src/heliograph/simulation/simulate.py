@@ -8,13 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
@@ -120,26 +119,28 @@ def monte_carlo(
     if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
         raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
     single = precision == "float32"
-    part = None if smooth is None else smoothed_part(network, smooth, horizon)
+    smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and not network.meshes and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
-        made: Record | Any = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
-        if made is not None:
-            return made
+        native_result: Record | Any = natively(
+            network, u, base, any_reducer, first_run, runs, chunk, progress, smoothing
+        )
+        if native_result is not None:
+            return native_result
     # Otherwise XLA: the world, and what is collected of it.
-    filters = AllFilters(network, part and part.kinds)
+    filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
     both: WithSmoothed[PyTree] = WithSmoothed(reducer)
-    keeper = reducer if part is None else both
-    job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
+    keeper = reducer if smoothing is None else both
+    job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
     recorded = _recorded(job, first_run, runs, chunk, progress)
-    known = network.in_single_precision() if single else network
-    if part is not None:
-        claims = lowered(part.claims) if single else part.claims
-        result: Record | Any = both.finished(*recorded, known, part._replace(claims=claims))
+    claiming = network.in_single_precision() if single else network
+    if smoothing is not None:
+        claims = lowered(smoothing.claims) if single else smoothing.claims
+        result: Record | Any = both.finished(*recorded, claiming, smoothing._replace(claims=claims))
         return result
-    return reducer.finish(*recorded, known)
+    return reducer.finish(*recorded, claiming)
 
 
 class _Job(Module):

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import Plan
@@ -20,7 +19,7 @@ from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.centres.centre import (
     Centre,
     CentreState,
@@ -132,14 +131,14 @@ class AllFilters(Module):
         "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
         `skip` has the reasons of the same form not to use data.
         """
-        local, central, sent, known, reporting = states
+        filter_states, central, quantizer_states, centre_states, reporting = states
         # The nodes' filters.
-        reasons = [None] * len(local) if skip is None else skip[0]
-        results = [
+        reasons = [None] * len(filter_states) if skip is None else skip[0]
+        stepped = [
             item.step(state, z[item.group], u, k, why)
-            for item, state, why in zip(self.alike, local, reasons, strict=True)
+            for item, state, why in zip(self.alike, filter_states, reasons, strict=True)
         ]
-        estimates = tuple(single.estimate for _, single in results)
+        estimates = tuple(single.estimate for _, single in stepped)
         # Central filters, on all measurements in the order of the nodes.
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
@@ -151,15 +150,15 @@ class AllFilters(Module):
         uplinks: dict[str, PyTree] = {}
         after = []
         # Fusions of the estimates, through their quantizers.
-        for item, state in zip(self.fusions, sent, strict=True):
+        for item, state in zip(self.fusions, quantizer_states, strict=True):
             following, outcome, traffic = item.step(state, estimates, k)
             after.append(following)
             fused |= outcome
             uplinks |= traffic
         # Informed centres, which propagate the joint moments of the errors.
         learned = []
-        for centre, state in zip(self.centres, known, strict=True):
-            following, outcome = self._centred(centre, state, local, z, estimates, u, k)
+        for centre, state in zip(self.centres, centre_states, strict=True):
+            following, outcome = self._centred(centre, state, filter_states, z, estimates, u, k)
             learned.append(following)
             fused |= outcome
         # Centres with reports over uplinks.
@@ -177,16 +176,17 @@ class AllFilters(Module):
             published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Next states and results.
-        local, central = tuple(state for state, _ in results), {name: state for name, (state, _) in received.items()}
-        following = local, central, tuple(after), tuple(learned), published
-        result: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
+        filter_states = tuple(state for state, _ in stepped)
+        central = {name: state for name, (state, _) in received.items()}
+        following = filter_states, central, tuple(after), tuple(learned), published
+        outputs: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
         if self.smooths:
-            result["smoother_steps"] = tuple(single.steps for _, single in results)
-            result["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
+            outputs["smoother_steps"] = tuple(single.steps for _, single in stepped)
+            outputs["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
-            result["judged"] = tuple(single.judgement for _, single in results)
-            result["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
-        return following, result
+            outputs["judged"] = tuple(single.judgement for _, single in stepped)
+            outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
+        return following, outputs
 
     def _centred(
         self,

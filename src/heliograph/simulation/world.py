@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
 
 from heliograph.codegen.rules.arrived import arrived
 from heliograph.model.estimate import Estimate
@@ -10,6 +9,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.medium import AbstractMedium
 from heliograph.simulation.stepping import AllFilters

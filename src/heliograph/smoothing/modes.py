@@ -157,11 +157,7 @@ class FixedPoint(AbstractSmoothing):
 
 
 def named_smoothing(name: str) -> AbstractSmoothing | None:
-    """Smoothing by a word of the command line: "all" for the fixed interval, a number for a lag, nothing for none.
-
-    Raises:
-        ValueError: another word.
-    """
+    """Smoothing by a word of the command line: "all" for the fixed interval, a number for a lag, nothing for none."""
     if name == "":
         return None
     if name == "all":

@@ -22,9 +22,8 @@ from heliograph.filters.modes.side_information import SideInformation, SideInfor
 from heliograph.filters.modes.uncertain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
-from heliograph.model.of_inputs import OfInputs
 from heliograph.model.over_time import OverTime, first, over_time, unstack
-from heliograph.model.plant import AnyPlant, LinearPlant, Plant
+from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module

@@ -16,10 +16,9 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.atoms import known
-from heliograph.random_affine.combine import Series
+from heliograph.random_affine.combine import Series, known
+from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
-from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run

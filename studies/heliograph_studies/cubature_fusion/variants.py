@@ -116,7 +116,7 @@ class MixedCross(AbstractFilter):
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        size = initial_size(self.base.initial_mean, self.base.initial_covariance)
+        size = initial_size(self.base)
         after, innovation = corrected(prior, signal, channel, self.base.rule, jnp.asarray(z), size)
         return Propagated(*after, state.points), innovation
 

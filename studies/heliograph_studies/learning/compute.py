@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.learning.recordings_apart import fit_each
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import networks, one_trial, relay
 from heliograph_studies.demo.learned import direct, fitted, judged, learn, parameters, relayed
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
+from heliograph_studies.learning.recordings_apart import fit_each
 from heliograph_studies.learning.setting import METHODS, ROWS, Row, Setting, learned, square_wave, true_values, world
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages

@@ -10,7 +10,7 @@ from heliograph.linear.system import LinearSystem, Schedule, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.random_affine.atoms import known
+from heliograph.random_affine.combine import known
 
 
 class Printed(NamedTuple):

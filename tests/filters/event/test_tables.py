@@ -31,7 +31,7 @@ def distance(x):
     [(MOVING, SURE, None), (MOVING, LOSSY, None), (MOVING, BURSTS, 10), (RANGING, SURE, None), (RANGING, LOSSY, None)],
     ids=["moving", "moving, lossy", "moving, bursts, heartbeat", "range", "range, lossy"],
 )
-def test_vectors_and_ranges_beside_forty_thousand_particles(numbers, link, heartbeat):
+def test_vectors_and_ranges_agree_with_forty_thousand_particles(numbers, link, heartbeat):
     """Error of x_1 within 3 %, NEES from 0.9 to 1.1; in expectation given the data, so that few runs are enough."""
     moving, runs, (channel, *modes) = numbers is MOVING, 12, link
     plant = hg.LinearPlant(numbers["a"], numbers["q"], [0.0, 0.0], numbers["p"])

@@ -6,7 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.filters.gaussian.factored import gain_spread
 from heliograph.model.over_time import at
-from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.combine import GainAndNoise
 from heliograph.random_affine.moments.second_moments import second_order
 
 FADED = hg.hop(hg.Rayleigh(0.8), noise=0.02)

@@ -52,7 +52,7 @@ def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
 
 
-def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
+def test_a_run_takes_the_form_that_its_numbers_need():
     """Beside a precise one or alone, a run's bits are the same."""
     plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
 
@@ -84,10 +84,12 @@ def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
 WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
 
 
-def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
+def test_what_rounding_leaves_of_a_variance_is_right_or_is_no_less():
     """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
 
-    A claimed variance is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is claimed to 1e-3.
+    Then the velocity's variance is claimed by 1e-14 of the prior's too large, and with the next positions what is true
+    comes back: after four at most two and a half times it. Where the sensor's is 1e-11 of the prior's, a variance is
+    claimed to 1e-3.
     """
     noise = [[1e-9, 0.0], [0.0, 1e-9]]
     lost = 0
@@ -99,9 +101,9 @@ def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
             result = claimed(item)
             if precise + 1e-9 >= 1e-11 * wide:
                 np.testing.assert_allclose(result, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
-            known = ~np.isnan(result)
-            lost += np.sum(~known)
-            np.testing.assert_allclose(result[known], expected[known], rtol=0.05, err_msg=f"{wide} {precise}")
+            lost += np.sum(result > 1.05 * expected)
+            assert np.all((result >= 0.95 * expected) & (result <= 1.05 * expected + 5e-14 * wide)), (wide, precise)
+            assert np.all(result[-1] <= 2.51 * expected[-1]), (wide, precise)
     assert 0 < lost < WIDE.size * PRECISE.size * STEPS
 
 
@@ -127,7 +129,7 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
 def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
     """x = v a with one unknown a: the first output tells it, a second only what the mean's rounding is.
 
-    Of P what remains is the square of the rounding of the mean, (5 eps |v|)^2 and what K adds to it.
+    Of P what remains is the square of the rounding of the mean, (5 eps |v|)^2, and of z, (5 eps |H| |v|)^2, by K.
     """
     random = np.random.default_rng(seed)
     v, h = random.normal(size=3), random.normal(size=(outputs, 3))
@@ -135,7 +137,9 @@ def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
     item = hg.kalman_filter(plant, hg.LinearSensor(h, np.zeros((outputs, outputs))))
     estimate = item.estimate(item.correct(item.init(), h @ v / (h[0] @ v))[0])
     np.testing.assert_allclose(estimate.mean, v / (h[0] @ v), rtol=1e-12)
-    assert 0 <= np.diagonal(estimate.covariance).max() < 1e-27
+    rounded = 5 * np.finfo(float).eps * np.abs(v) * (1 + np.abs(h[0]) @ np.abs(v) / np.abs(h[0] @ v))
+    assert np.all(np.diagonal(estimate.covariance) >= 0)
+    assert np.all(np.diagonal(estimate.covariance) < 4 * (rounded**2).max())
 
 
 def test_a_state_that_is_known_stays_known_where_its_motion_enlarges_rounding():

@@ -120,7 +120,7 @@ def test_horizon_beyond_the_schedule_is_refused_by_the_driver():
 
 
 def test_a_stream_beyond_the_horizon_keeps_the_last_matrices():
-    """A settled model of constant matrices: designed for 60 steps, at step 80 as one designed for 80."""
+    """A model of constant matrices in steady state: designed for 60 steps, at step 80 as one designed for 80."""
     plant, sensor = hg.LinearPlant([[0.7]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.5)
     short, long = (hg.Stream(hg.polynomial_filter(plant, sensor, hg.hop(0.9, 0.1), steps)) for steps in (60, 80))
     for z in np.random.default_rng(0).normal(size=80):

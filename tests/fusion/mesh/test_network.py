@@ -252,7 +252,7 @@ def test_losses_above_the_square_of_a_mode_are_refused(neighbours, arrivals, ref
         assert made().claims()["b"]["m"] == "upper"
 
 
-def test_a_decaying_mode_that_nobody_sees_is_kept_with_a_warning():
+def test_a_decaying_mode_that_nobody_observes_stays_with_a_warning():
     plant = hg.LinearPlant(np.diag([1.02, 0.5]), 0.1 * np.eye(2), np.zeros(2), np.eye(2))
     rows = {"a": ([[1.0, 0.0]], 0.3), "b": ([[1.0, 0.0]], 0.3)}
     with pytest.warns(UserWarning, match="a decaying mode is observed by nobody upstream"):

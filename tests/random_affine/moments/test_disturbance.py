@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine.moments.disturbance import disturbed_gain
+from heliograph.h_infinity.system import disturbed_gain
 from tests.h_infinity.h_infinity_problems import channel
 
 probability = st.floats(0.0, 1.0)

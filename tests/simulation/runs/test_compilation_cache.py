@@ -46,7 +46,7 @@ def test_a_second_process_compiles_nothing(tmp_path):
     assert first[2] > 0 and second[2] == 0 and second[1] >= first[2]
 
 
-def test_the_users_own_choice_stays(monkeypatch, tmp_path):
+def test_the_choice_of_the_user_stays(monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     assert hg.simulation.keep_compilations(tmp_path / "other") == tmp_path
     assert not (tmp_path / "other").exists()

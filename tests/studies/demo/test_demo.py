@@ -285,7 +285,7 @@ def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned, folder: Pa
     assert scale.low is not None and scale.high is not None and scale.low < robot.RANGE_SCALE < scale.high
 
 
-def test_its_maximum_is_one_of_the_filters_own_likelihood(fit: hg.learning.Fit, recording: PlazaRecording) -> None:
+def test_its_maximum_is_one_of_the_likelihood_by_the_filter(fit: hg.learning.Fit, recording: PlazaRecording) -> None:
     """That of the filter with the learned constants, and less with each of them moved by a standard error."""
     network = single(PLAZA2, robot.Constants(**fit.values), hg.perfect(4))
     likelihood = hg.log_likelihood(
@@ -312,7 +312,7 @@ def test_what_is_learned_behind_the_relay_is_its_gains_variance(recording: Plaza
     assert sums[0] == pytest.approx(sums[1], rel=1e-10)
 
 
-def test_what_was_learned_is_written_beside_the_scores(folder: Path, learned: Learned) -> None:
+def test_what_was_learned_is_written_next_to_the_scores(folder: Path, learned: Learned) -> None:
     result = json.loads((folder / "summary.json").read_text())["learned"]
     assert result["second_half"] == learned.second_half
     assert result["parameters"]["gyro_rate"]["estimate"] == learned.parameters["gyro_rate"].estimate

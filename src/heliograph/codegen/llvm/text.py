@@ -219,18 +219,18 @@ class Writer:
             self.line(f"{counter}.next = add i64 {counter}, 1")
             self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
             self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
-            results = following
+            finals = following
         else:
-            following, results = self._turns(loop, name, moving)
+            following, finals = self._turns(loop, name, moving)
         # The phi nodes come first, but their arguments are known only now.
         phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
         for k, start, after in zip(moving, starts, following, strict=True):
-            local = vector(loop.parameters[k].type, self.width)
-            phis.append(f"  %{name}.p{k} = phi {local} [{start}, %{before}], [{after}, %{self.label}]")
+            kind = vector(loop.parameters[k].type, self.width)
+            phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{before}], [{after}, %{self.label}]")
         self.lines[place:place] = phis
         self.start(f"{name}.end")
         self.scopes.pop()
-        for k, result in zip(moving, results, strict=True):
+        for k, result in zip(moving, finals, strict=True):
             self._keep(loop.results[k], result)
 
     def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:

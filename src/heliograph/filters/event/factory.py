@@ -3,6 +3,7 @@
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
@@ -56,7 +57,7 @@ def event_filter(
     known, lost = check_count("known", known), check_count("lost", lost, 0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     described, initial = _described(channel)
-    steps = unstack(described) if isinstance(described, OverTime) else [described]
+    steps = unstack(described)
     outputs = len(first(sensor).outputs)
     loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
@@ -109,7 +110,7 @@ def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray
     drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
-    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(item) for item in unstack(channel)]
     parts = by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
 
@@ -147,8 +148,10 @@ def _check_region(trigger: AbstractThreshold, outputs: int, received: int, steps
     """Refuse what the sum of Gaussians does not carry."""
     if outputs == 1:
         return
-    if trigger.region == "ball":
-        raise fail("region of the trigger", '"box" or "each", which the filter can cut to', "ball")
+    if trigger.region == "ball" and outputs > MOST_COMPONENTS:
+        raise fail(
+            "outputs of a sensor behind a ball", f"{MOST_COMPONENTS} at most, for which a filter can cut to it", outputs
+        )
     if trigger.region == "each":
         if received != outputs:
             raise fail("channel of components that are each sent alone", f"{outputs} outputs", received)

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
-from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -17,8 +17,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive
 from heliograph.filters.modes.side_information import SideInformation, with_flag
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -99,8 +98,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         # A value: each mode's update, joined.
         modes = len(state.law)
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        size = initial_size(at(self.plant, 0))
         belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
         result, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
         came = join(Parts(safe_log(weight), result.mean, result.covariance, jnp.eye(len(weight))[:, None]))
@@ -147,14 +145,9 @@ class StochasticEventFilter(AbstractSizedFilter):
         """The Gaussian."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def smoother_step(
-        self, before: StochasticBelief, prior: StochasticBelief, after: StochasticBelief, innovation: Innovation,
-        z: ArrayLike, u: ArrayLike, k: Step,
-    ) -> AbstractSmootherStep:  # fmt: skip
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """The moments around the update."""
-        local = Belief(before.mean, before.covariance)
-        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, self.claim)
+        return moments_around(self, step)
 
 
 def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
@@ -30,7 +29,7 @@ from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal, diagonal_of
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 
 ITERATIONS = 5
 PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: as much as six noises of the filter's own variance say

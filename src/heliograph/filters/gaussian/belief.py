@@ -1,6 +1,7 @@
 """Filters whose state is a mean and a covariance: their prior, prediction and estimate, and the one without data."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -8,15 +9,15 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Transformed, linear_transform
 from heliograph.filters.innovation import no_innovation
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step.building import MomentsSmootherStep, moments_smoother_step
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 
 class Belief(NamedTuple):
@@ -52,6 +53,10 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+        """Return the moments around the update."""
+        return moments_around(self, step)
+
 
 def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
     """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
@@ -60,6 +65,26 @@ def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief,
     else:
         moved = transform.apply(plant.moves(u, state.mean), *state)
     return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)
+
+
+class PredictsByTransform(Protocol):
+    """A filter that predicts its plant by a transform."""
+
+    plant: AnyPlant
+    transform: AbstractTransform
+    claim: Claim
+
+
+def moments_around(
+    item: PredictsByTransform,
+    step: StepTrace,
+    whole: Callable[[PyTree], Belief] | None = None,
+) -> MomentsSmootherStep:
+    """Smoother step by the moments around an update; `whole` reads them off a state that has others than its own."""
+    plant, read = at(item.plant, step.k), whole or (lambda state: Belief(state.mean, state.covariance))
+    before, prior, after = map(read, step[:3])
+    cross = predicted(plant, item.transform, before, jnp.asarray(step.u)).cross
+    return moments_smoother_step(after, prior, cross, item.claim, plant.angles)
 
 
 def prior_of(
@@ -81,13 +106,6 @@ class OpenLoop(AbstractBeliefFilter):
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Return the state as it is, whatever the length of z."""
         return state, no_innovation()
-
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
-        """Return the prediction as a smoother step, with no measurement after it."""
-        cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, self.claim, first(self.plant).angles)
 
 
 def open_loop_filter(

@@ -26,6 +26,7 @@ from heliograph.numerics.linalg import (
     sum_of_squares,
     symmetric,
     times,
+    times_vector,
     trace,
     transpose,
     with_rounding,
@@ -40,7 +41,8 @@ class Signal(NamedTuple):
     """Prior moments of the sensor's signal y.
 
     Shapes: mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m). For a
-    linear sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update avoids cancellation.
+    linear sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update avoids cancellation, and
+    the deviation (m,) that rounding alone gives to y (`output_rounding`).
     """
 
     mean: jax.Array
@@ -49,6 +51,7 @@ class Signal(NamedTuple):
     second: jax.Array
     matrix: jax.Array | None = None
     noise: jax.Array | None = None
+    rounding: jax.Array | None = None
 
     def about_mean(self) -> "Signal":
         """Return the moments of y - E y: all that the update behind a known gain depends on, whatever was estimated."""
@@ -124,7 +127,21 @@ def _known_gain_correction(
         return gain_and_bound(prior, cross, spread + mean_part)
     received = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
     noise = spread + jnp.where(both, congruence(channel.mean_gain, signal.noise), 0.0)
-    return gain_and_covariance(prior, cross, spread + mean_part, received, noise)
+    rounded = jnp.where(present, _rounding(signal, channel), 0.0)
+    return gain_and_covariance(prior, cross, spread + mean_part, received, noise, rounded)
+
+
+def _rounding(signal: Signal, channel: SecondOrder) -> jax.Array:
+    """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gain's noise.
+
+    Of outputs behind one gain some combination has next to none of that noise, and which it is, rounding decides.
+    """
+    through = jnp.abs(channel.mean_gain)
+    of_mean = jnp.zeros_like(signal.mean) if signal.rounding is None else signal.rounding
+    count = signal.second.shape[0]
+    variances = transpose(diagonal_of(jnp.moveaxis(jnp.asarray(diagonal_of(channel.spread.center)), 0, 2)))
+    unit = 100 * count * float(np.finfo(of_mean.dtype).eps)
+    return times_vector(through, of_mean) ** 2 + unit * times_vector(variances[:, :count], diagonal_of(signal.second))
 
 
 def _cross(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
@@ -202,16 +219,21 @@ def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tupl
 
 
 def gain_and_covariance(
-    prior: jax.Array, cross: jax.Array, omega: jax.Array, output: jax.Array, noise: jax.Array
+    prior: jax.Array,
+    cross: jax.Array,
+    omega: jax.Array,
+    output: jax.Array,
+    noise: jax.Array,
+    rounded: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Gain and covariance for z = H x + noise, with H (m, n) and noise covariance N (m, m), Omega = H P H' + N.
 
     Where a measurement is precise, N far below Omega, the difference cancels: (1 + (m + 2) eps) P - K C is
-    eps Omega / N too large. There `precise_update` uses one component after another. It takes several times the
-    products, so it is computed for all runs where any needs it, and not otherwise; each run's numbers decide which of
-    the two applies.
+    eps Omega / N too large. There `precise_update` uses one component after another, each with the variance `rounded`
+    (m,) besides its noise. It takes several times the products, so it is computed for all runs where any needs it,
+    and not otherwise; each run's numbers decide which of the two applies.
     """
-    return _gain_and_covariance(prior, cross, omega, _solved(omega, cross), output, noise)
+    return _gain_and_covariance(prior, cross, omega, _solved(omega, cross), output, noise, rounded)
 
 
 _solved = runs_last(solve)
@@ -264,10 +286,11 @@ def _by_precision(
     solved: jax.Array,
     output: jax.Array,
     noise: jax.Array,
+    rounded: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     return pick(
         _is_precise(omega, noise),
-        lambda: precise_update(prior, output, noise),
+        lambda: precise_update(prior, output, noise, rounded),
         lambda: (transpose(solved), _difference(prior, cross, solved)),
     )
 

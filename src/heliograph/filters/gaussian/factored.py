@@ -46,9 +46,6 @@ def gain_spread(channel: SecondOrder | OverTime) -> np.ndarray | OverTime:
     A channel is described by E[(z - E z)(z - E z)' | y] alone, which leaves open how E[dH_ia dH_jb] divides between
     (a, b) and (b, a). Where one of the two is zero because an entry never varies, the other is all; else they are taken
     to be equal. A spread that then is no sum of squares is refused.
-
-    Raises:
-        ValueError: uncertain probabilities, a spread that is no sum of squares in this sense.
     """
     # One set of operators per step, padded with zeros to the same number.
     if isinstance(channel, OverTime):
@@ -243,11 +240,7 @@ def _used(mean: jax.Array, factors: Factors, rows: jax.Array, noise: jax.Array) 
 
 
 def factored(base: AbstractFilter) -> AbstractFilter:
-    """Return the filter with a factored covariance, whose variances stay positive in single precision.
-
-    Raises:
-        ValueError: a filter for which this form is not derived.
-    """
+    """Return the filter with a factored covariance, whose variances stay positive in single precision."""
     # Only filters whose update is linear in the state, or a cubature of it.
     expected = "a linear, extended or cubature filter, or a schedule of gains"
     if not isinstance(base, GaussianFilter | LinearFilter):

@@ -138,11 +138,7 @@ def columns_of(covariance: Array) -> Columns:
 
 
 def columns_of_known(covariance: np.ndarray) -> np.ndarray:
-    """W (n, rank) with W W' = P, by Cholesky's method with pivots, each component scaled to unit variance.
-
-    Raises:
-        ValueError: a matrix that is no covariance.
-    """
+    """W (n, rank) with W W' = P, by Cholesky's method with pivots, each component scaled to unit variance."""
     # Correlations: the rank is decided in units of each component's deviation.
     unit = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     scale = np.where(unit > 0, unit, 1.0)

@@ -1,27 +1,23 @@
 """Gaussian filter: mean and covariance by a transform (cubature, Jacobian), on the channel's second moments."""
 
-from dataclasses import replace
-from typing import TypeVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link, mean_gain, perfect
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.filters.smoother_step.building import linear_smoother_step, observed_through
+from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, continued, nearest
@@ -29,11 +25,8 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
 from heliograph.random_affine.outliers import is_bounded
-
-Element = TypeVar("Element", AbstractRandomAffine, SecondOrder)
 
 
 class GaussianFilter(AbstractBeliefFilter):
@@ -59,32 +52,18 @@ class GaussianFilter(AbstractBeliefFilter):
         """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         unknown = signal.about_mean() if self.linear else signal
-        size = initial_size(self.initial_mean, self.initial_covariance)
+        size = initial_size(self)
         link, z = at(self.channel, k), jnp.asarray(z)
         return corrected(state, signal, link, self.rule, z, size, self.observed_angles, unknown)
 
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update itself where it is linear, else the moments around it."""
-        plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
-            cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
-            return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
-        # F, Q and M H of the step.
-        u = jnp.asarray(u)
-        observed_of, process = observed_through(channel.mean_gain, sensor.matrix), plant.noise_covariance(u)
-        step = linear_smoother_step(
-            after,
-            prior,
-            plant.transition_matrix(u),
-            process,
-            observed_of,
-            innovation.value,
-            innovation.covariance,
-            self.claim,
-        )
-        return replace(step, angles=plant.angles)
+            return super().smoother_step(step)
+        plant, sensor, channel = at((self.plant, self.sensor, self.channel), step.k)
+        u = jnp.asarray(step.u)
+        output = observed_through(channel.mean_gain, sensor.matrix)
+        return linear_smoother_step(step, (plant.transition_matrix(u), plant.noise_covariance(u), output), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
@@ -119,6 +98,8 @@ def corrected(
     `unknown`: what of the signal decides gain and covariance, where that is less than all.
     """
     unknown = signal if unknown is None else unknown
+    if unknown.matrix is not None:
+        unknown = unknown._replace(rounding=output_rounding(unknown.matrix, size))
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))
@@ -139,9 +120,8 @@ def _use(
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
     """Second moments of the channel in the form of the update, for each step where it varies."""
-    if isinstance(channel, OverTime):
-        return over_time([update.describe(c) for c in unstack(channel)])
-    return update.describe(channel)
+    result: SecondOrder | OverTime = at_each_step(update.describe, channel)
+    return result
 
 
 def _build(
@@ -164,7 +144,7 @@ def _build(
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
-    pairs = zip(_over_steps(channel), _over_steps(described), strict=True)
+    pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
@@ -185,10 +165,6 @@ def _build(
         inputs=start.inputs,
         received=first(channel).outputs,
     )
-
-
-def _over_steps(item: Element | OverTime) -> list[Element]:
-    return unstack(item) if isinstance(item, OverTime) else [item]
 
 
 def gaussian_filter(

@@ -4,7 +4,7 @@ One component after another on a root of the covariance: of two precise componen
 H P H' + N resolves neither their difference nor N.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -45,22 +45,26 @@ class Component(NamedTuple):
     least: jax.Array
 
 
-def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """K (n, m) and P+ of z = H x + v, Cov v = N, by its components one after another; the axis of runs is last.
+def precise_update(
+    prior: jax.Array, output: jax.Array, noise: jax.Array, rounded: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """K (n, m) and P+ of z = H x + v, by its components one after another; the axis of runs is last.
+
+    Cov v is N and, of each component, the variance `rounded` (m,) that rounding gives it.
 
     f = R' h', s = f' f + d, k = R f / s, R+ = R (I - f f' / (s + root(s d))); with K of all
     P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. The mean itself
     is known to its rounding alone, (n + 2) eps of each deviation: a component of which nothing else is unknown still
     corrects that, or it would grow, step by step, where P says that the state is known. The prior itself is known to
     eps |P|, with which P+ is eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a
-    variance, as where a wide prior or a singular noise ties states together to the last digit, it has no digits, and P+
-    is NaN. Where no more is left than the square of the mean's own rounding, as of tied states behind a noise-free
-    output, the state is known.
+    variance, as where a wide prior or a singular noise ties states together to the last digit, it has no digits, and
+    so much is added to it, which is no less than what this gain leaves. Where no more is left than the square of the
+    mean's own rounding, as of tied states behind a noise-free output, the state is known.
 
     Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
     Filtering for stochastic processes (1968).
     """
-    n, m = len(prior), len(output)
+    n, m, noise = len(prior), len(output), noise + diagonal(rounded)
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
     # Square root of P, and the components of z with uncorrelated noises.
     start = root(prior)
@@ -73,7 +77,8 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise)
     remaining = jnp.asarray(identity(n, gain)) - times(gain, output)
-    return times(taken.whole, turn), jnp.where(_has_digits(prior, start, remaining, after), after, jnp.nan)
+    of_data = times_vector(gain * gain, rounded)
+    return times(taken.whole, turn), after + diagonal(_lost(prior, start, remaining, after, of_data))
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
@@ -96,13 +101,14 @@ def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[
     return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, least)
 
 
-def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
-    """Test whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the mean's rounding squared."""
+def _lost(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array, of_data: jax.Array) -> jax.Array:
+    """A hundred times eps |I - K H| |P| |I - K H|' where less is left of a variance, but for rounding of mean and z."""
     n, eps = len(prior), float(np.finfo(prior.dtype).eps)
     remaining, left = jnp.abs(remaining), diagonal_of(after)
-    lost, reach = summed(times(remaining, jnp.abs(prior)) * remaining, 1), times(remaining, jnp.abs(start))
+    lost, reach = LEFT * eps * summed(times(remaining, jnp.abs(prior)) * remaining, 1), times(remaining, jnp.abs(start))
     of_mean = summed(reach * reach, 1) + diagonal_of(prior)
-    return jnp.all((LEFT * eps * lost <= left) | (left <= (4 * (n + 2) * eps) ** 2 * of_mean), axis=0)
+    known = 16 * (((n + 2) * eps) ** 2 * of_mean + of_data)
+    return jnp.where((lost <= left) | (left <= known), 0.0, lost)
 
 
 class _Taken(NamedTuple):
@@ -140,11 +146,28 @@ def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
 
 
-def initial_size(mean: Array, covariance: Array) -> Float[jax.Array, " n"]:
+class HasStart(Protocol):
+    """A plant, or a filter that starts from another law."""
+
+    initial_mean: Array
+    initial_covariance: Array
+
+
+def initial_size(item: HasStart) -> Float[jax.Array, " n"]:
     """E[x_i^2] before the first step, (n,)."""
-    mean = jnp.asarray(mean)
-    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(covariance))
+    mean = jnp.asarray(item.initial_mean)
+    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(item.initial_covariance))
     return seconds
+
+
+def output_rounding(matrix: Array, size: Array) -> Float[jax.Array, " m"]:
+    """Deviation of H x by rounding alone, (n + 2) eps |H| root E[x x'] of the state at the start: (m,).
+
+    What a combination of outputs without noise says of a state that is known better is no measurement: by it the
+    rounding of z would be divided by a deviation below it.
+    """
+    reach: jax.Array = jnp.abs(jnp.asarray(matrix)) @ jnp.sqrt(size)
+    return (len(size) + 2) * float(np.finfo(reach.dtype).eps) * reach
 
 
 @runs_last

@@ -6,17 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.gaussian.scores import AbstractWeights, Corrected, Expected, score_update, weighted_update
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_transform
 from heliograph.filters.innovation import innovation_covariance, log_density
 from heliograph.filters.robust_noise import ReceivedNoise, Vector, received
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.filters.weights import StudentVB
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
@@ -61,23 +59,18 @@ class RobustFilter(AbstractBeliefFilter):
             law = noise.law(sensed)
             after = score_update(before, z, *law)
             center, total = law.mean_and_variance()
-            return Belief(after.mean, after.covariance), _innovation(before, z, center, diagonal(total), after, True)
-        after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
-        return Belief(after.mean, after.covariance), _innovation(before, z, noise.center, noise.covariance, after)
+            innovation = _innovation(before, z, center, diagonal(total), after, True)
+        else:
+            after = weighted_update(before, z, noise.center, noise.covariance, self.rule)
+            innovation = _innovation(before, z, noise.center, noise.covariance, after)
+        size = initial_size(self)
+        return Belief(after.mean, above_rounding(after.covariance, state.covariance, size)), innovation
 
     def expected(self, state: Belief, k: Step) -> tuple[Expected, jax.Array]:
         """Moments of what would arrive without the noise that may hold outliers, and the sensor's mean signal."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         signal = signal_without_noise(at(self.plant, k).angles, sensor, self.transform, state)
         return expected_of(state, signal, channel), signal.mean
-
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
-        """The moments around the update."""
-        plant = at(self.plant, k)
-        cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
 
 
 def signal_without_noise(angles: Angles, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:

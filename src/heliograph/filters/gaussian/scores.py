@@ -143,7 +143,7 @@ def joint_update(before: Expected, e: jax.Array, present: jax.Array, noise: jax.
     else:
         matrix = jnp.where(present[:, None], before.matrix, 0.0)
         rest = jnp.where(both, before.noise + noise, 0.0) + absent(present)
-        gain, after = gain_and_covariance(before.covariance, cross, omega, matrix, rest)
+        gain, after = gain_and_covariance(before.covariance, cross, omega, matrix, rest, jnp.zeros_like(e))
     used = jnp.any(present, axis=0)
     mean = before.mean + summed(gain * jnp.where(present, e, 0.0)[None], 1)
     return mean, jnp.where(used, after, before.covariance)

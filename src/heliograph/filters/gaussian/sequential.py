@@ -1,6 +1,7 @@
 """Central filter of several nodes: one prediction, then their measurements one after another."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -8,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation, weakest
-from heliograph.model.over_time import alike, at, first, stack
+from heliograph.model.over_time import alike, stack
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -66,13 +66,9 @@ class SequentialFilter(AbstractSizedFilter):
         posterior = self.filters[0].estimate(state)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments around all nodes' updates."""
-        head = self.filters[0]
-        cross = predicted(at(head.plant, k), head.transform, before, jnp.asarray(u)).cross
-        return moments_smoother_step(after, prior, cross, self.claim, first(head.plant).angles)
+        return replace(moments_around(self.filters[0], step), claim=self.claim)
 
 
 def _joined(parts: Sequence[Innovation]) -> Innovation:

@@ -20,9 +20,8 @@ from heliograph.filters.gaussian.correction import (
 )
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
+from heliograph.random_affine.combine import GainAndNoise, Series
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
@@ -187,9 +186,6 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
     """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
 
     `variance` is the bound on var g of a hop.
-
-    Raises:
-        ValueError: a channel that is not a chain of scalar hops.
     """
     hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
     # The recursion over the hops.

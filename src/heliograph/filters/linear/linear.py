@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
-from heliograph.filters.gaussian.gaussian import describe
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.gaussian import corrected, describe
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
 from heliograph.filters.modes.side_information import side_information_filter
 from heliograph.filters.modes.uncertain import uncertain_modal_filter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
@@ -27,7 +27,7 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, check_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import congruence, times, times_vector, transpose
@@ -94,58 +94,27 @@ class LinearFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Correct with the components of z that arrived."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        # Moments of the signal: the innovation part C P C' + R, and E[y y'] before any data.
-        y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-        y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
-        # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
-        gain, bound = self.rule.correct(state.covariance, y, channel, ~jnp.isnan(z))
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
-        bound = above_rounding(bound, state.covariance, size)
-        mean, covariance, expected = used(
-            state.mean,
-            state.covariance,
-            gain,
-            bound,
-            sensor.matrix,
-            sensor.noise.mean,
-            channel.mean_gain,
-            channel.offset,
-            z,
-        )
-        innovation = gaussian_innovation(z, expected, innovation_covariance(y, channel))
-        return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), innovation
+        plant, sensor, channel = at(self.plant, 0), at(self.sensor, k), at(self.channel, k)
+        return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), initial_size(plant))
 
     @in_float64
     def estimate(self, state: LinearBelief) -> Estimate:
         """Mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def smoother_step(
-        self,
-        before: LinearBelief,
-        prior: LinearBelief,
-        after: LinearBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update itself, or the moments around it where E[G] is uncertain."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        transition = at(self.plant, k).transition_matrix(jnp.asarray(u))
+        (plant, sensor, channel), u = at((self.plant, self.sensor, self.channel), step.k), jnp.asarray(step.u)
+        transition = plant.transition_matrix(u)
         if not self.mean_known:
-            cross = before.covariance @ transition.T
-            return moments_smoother_step(after, prior, cross, "nominal")
-        total = innovation.covariance
+            return moments_smoother_step(step.after, step.prior, step.before.covariance @ transition.T, "nominal")
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
-            y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-            total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        # F = A, H = M C, process noise Q.
+            y = signal(step.prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+            total = known_gain_covariance(y, channel, ~jnp.isnan(jnp.asarray(step.z)))
+            step = step._replace(innovation=replace(step.innovation, covariance=total))
+        # F = A, process noise Q, H = M C.
         output = observed_through(channel.mean_gain, sensor.matrix)
-        process = at(self.plant, k).noise_covariance(jnp.asarray(u))
-        return linear_smoother_step(after, prior, transition, process, output, innovation.value, total, self.claim)
+        return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -189,23 +158,15 @@ def signal(
     return Signal(mean, times(c, cross) + noise, cross, second)
 
 
-@runs_last
-def used(
-    mean: jax.Array,
-    prior: jax.Array,
-    gain: jax.Array,
-    bound: jax.Array,
-    c: jax.Array,
-    noise_mean: jax.Array,
-    channel_gain: jax.Array,
-    channel_offset: jax.Array,
-    z: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Posterior mean and covariance given z, and the expected measurement M (C m + v) + b."""
-    present = ~jnp.isnan(z)
-    expected = times_vector(channel_gain, times_vector(c, mean) + noise_mean) + channel_offset
-    after = mean + times_vector(gain, jnp.where(present, z - expected, 0.0))
-    return after, jnp.where(jnp.any(present, axis=0), bound, prior), expected
+def corrected_linear(
+    state: LinearBelief, sensor: LinearSensor, channel: SecondOrder, rule: Polytope, z: jax.Array, size: jax.Array
+) -> tuple[LinearBelief, Innovation]:
+    """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
+    matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
+    before = signal(state[1:], matrix, mean, noise)._replace(matrix=matrix, noise=noise)
+    now = before._replace(mean=matrix @ state.mean + mean)
+    after, innovation = corrected(Belief(*state[:2]), now, channel, rule, z, size, unknown=before)
+    return state._replace(mean=after.mean, covariance=after.covariance), innovation
 
 
 def linear_filter(

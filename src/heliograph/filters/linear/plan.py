@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -87,22 +87,13 @@ class PlannedFilter(AbstractSizedFilter):
         """Mean of the state, with the planned covariance of step k, common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
 
-    def smoother_step(
-        self,
-        before: PlannedMean,
-        prior: PlannedMean,
-        after: PlannedMean,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the planned smoother step with the mean and the innovation of these data."""
         if self.past is None:
-            return super().smoother_step(before, prior, after, innovation, z, u, k)
-        p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
-        residual = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
-        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), residual)
+            return super().smoother_step(step)
+        p, planned = at(self.steps, step.k), cast(AbstractSmootherStep, at(self.past, step.k))
+        residual = jnp.asarray(step.z) - _affine(p.output, step.prior.mean, p.offset)
+        return planned.with_data(jnp.asarray(step.after.mean), jnp.asarray(step.prior.mean), residual)
 
     def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """Return the filter with smoother steps, which are the same for all data."""
@@ -129,9 +120,6 @@ def plan(
 
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
     `projection` (n, N) maps the filter's mean to the plant's states.
-
-    Raises:
-        ValueError: inputs of another number than the filter's.
     """
     return _plan(filter, array("inputs", inputs, (None, len(filter.inputs))), projection)
 

@@ -12,7 +12,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.polynomial import memory_system
 from heliograph.linear.recursion import lmmse
@@ -51,7 +51,7 @@ class Centre(Module):
 
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
     """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
-    plants, sensors, channels = _over_steps(plant), _over_steps(sensor), _over_steps(channel)
+    plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
     if not all(has_known_gain(c) for c in channels):
         return None
     drifts = [np.asarray(p.noise_mean()) for p in plants]
@@ -72,10 +72,6 @@ def without_mean(plant: AnyPlant) -> AnyPlant:
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
     return LinearPlant(plant.matrix, about_mean(plant.noise), np.zeros(n), law, plant.input_matrix, plant.states)
-
-
-def _over_steps(item: Part | OverTime) -> list[Part]:
-    return unstack(item) if isinstance(item, OverTime) else [item]
 
 
 def _matrix(item: AbstractPlant | AbstractSensor) -> np.ndarray:
@@ -163,20 +159,12 @@ class PolynomialFilter(AbstractSizedFilter):
         """Estimate of the inner filter after step k, plus the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
-    def smoother_step(
-        self,
-        before: Centred,
-        prior: Centred,
-        after: Centred,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the smoother step of the lifted system, about the mean."""
-        z = _without_mean(self.centre, z, prior.mean, k)
-        inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
-        return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
+        z = monomials(_without_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
+        before, prior, after = (state.inner for state in step[:3])
+        inner = step._replace(before=before, prior=prior, after=after, z=z)
+        return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute the inner filter."""
@@ -374,5 +362,4 @@ def claim_of(channel: Channel) -> Claim:
     """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
     if first(channel).remembers:
         return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
-    items: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
-    return "exact" if all(c.corner_count() == 1 for c in items) else "nominal"
+    return "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"

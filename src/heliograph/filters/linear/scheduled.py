@@ -10,9 +10,10 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
+from heliograph.filters.gaussian.precise import above_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
@@ -176,10 +177,9 @@ class LinearSystemFilter(AbstractSizedFilter):
         used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
         # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
-        after = Belief(
-            mean + solved.T @ jnp.where(present, z - expected, 0.0),
-            covariance_after(spread, cross, used, solved, observed, noise),
-        )
+        left = covariance_after(spread, cross, used, solved, observed, noise)
+        left = above_rounding(left, spread, jnp.asarray(self.mean) ** 2 + jnp.diag(jnp.asarray(self.covariance)))
+        after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 
     @in_float64
@@ -188,25 +188,14 @@ class LinearSystemFilter(AbstractSizedFilter):
         projection = jnp.asarray(self.projection)
         return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
-    def smoother_step(
-        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractSmootherStep:
-        """Return the linear update."""
-        s: Steps = at(self.steps, k)
-        residual = jnp.asarray(z) - s.output @ prior.mean - s.offset
-        total = s.output @ prior.covariance @ s.output.T + s.noise
-        return linear_smoother_step(
-            after,
-            prior,
-            s.transition,
-            s.process,
-            s.output,
-            residual,
-            total,
-            self.claim,
-            self.projection,
-            pseudo_solve,
-        )
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
+        """Return the linear update, with the innovation of all of z, of which a filter around this one keeps a part."""
+        s: Steps = at(self.steps, step.k)
+        residual = jnp.asarray(step.z) - s.output @ step.prior.mean - s.offset
+        total = s.output @ step.prior.covariance @ s.output.T + s.noise
+        step = step._replace(innovation=Innovation(residual, total, jnp.zeros(())))
+        model = s.transition, s.process, s.output
+        return linear_smoother_step(step, model, self.claim, self.projection, pseudo_solve)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

@@ -9,8 +9,8 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import Plan, PlannedFilter
 from heliograph.filters.modes.modal import ObservationModel, observation_models
 from heliograph.model.channel import Channel, check_link
+from heliograph.model.enlarged import with_past
 from heliograph.model.over_time import at, first
-from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, check_horizon, fail, instance

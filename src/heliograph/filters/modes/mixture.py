@@ -10,11 +10,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
@@ -25,10 +25,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize, with_rounding
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Gaussian, Independent, Shaped
@@ -49,12 +48,7 @@ class Component(NamedTuple):
 
 
 def atoms_of(item: AbstractRandomAffine) -> list[Component]:
-    """All combinations of the atoms of a map's gains and noises.
-
-    Raises:
-        ValueError: a gain that is not discrete, a noise that is neither finite nor Gaussian, or a map of unknown kind;
-            more than COMPONENT_LIMIT combinations.
-    """
+    """All combinations of the atoms of a map's gains and noises."""
     match item:
         # z = g H y + n: every gain with every noise.
         case GainAndNoise():
@@ -247,7 +241,8 @@ class MixtureFilter(AbstractSizedFilter):
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
-        result = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
+        result = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
 
     @in_float64
@@ -255,19 +250,11 @@ class MixtureFilter(AbstractSizedFilter):
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
-    def smoother_step(
-        self,
-        before: MixtureBelief,
-        prior: MixtureBelief,
-        after: MixtureBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments around the update."""
-        cross = before.covariance @ at(self.plant, k).transition_matrix(jnp.asarray(u)).T
-        return moments_smoother_step(after, prior, cross, "nominal", first(self.plant).angles)
+        plant = at(self.plant, step.k)
+        cross = step.before.covariance @ plant.transition_matrix(jnp.asarray(step.u)).T
+        return moments_smoother_step(step.after, step.prior, cross, "nominal", plant.angles)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

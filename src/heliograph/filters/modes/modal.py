@@ -14,9 +14,10 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -80,6 +81,16 @@ class AbstractModalFilter(AbstractSizedFilter):
         """Precompute all covariances and gains."""
         return plan(self, inputs, self._projection())
 
+    def above_rounding(self, after: jax.Array, prior: jax.Array, law: jax.Array) -> jax.Array:
+        """Cov(zeta) and, for the part of x in each mode, its share of what the mean cannot say."""
+        return after + mean_rounding(at(self.plant, 0), law, after, prior)
+
+    def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
+        """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
+        of_outputs = output_rounding(at(self.sensor, k).matrix, initial_size(at(self.plant, 0)))
+        of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
+        return of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
+
     def _projection(self) -> Float[np.ndarray, "n N"]:
         return sum_of_modes(len(self.states), len(self.initial))
 
@@ -122,9 +133,13 @@ class ModalFilter(AbstractModalFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
-        observed, added, common = self._observe(state, k)
-        expected = common + observed @ (state.mean - known_part(state.moments[:, -1, -1], state.centre))
-        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
+        observed, added, common, rounded = self._observe(state, k)
+        law = state.moments[:, -1, -1]
+        expected = common + observed @ (state.mean - known_part(law, state.centre))
+        mean, covariance, innovation = linear_observation(
+            state.mean, state.covariance, observed, added, expected, rounded, z
+        )
+        covariance = self.above_rounding(covariance, state.covariance, law)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
@@ -133,41 +148,23 @@ class ModalFilter(AbstractModalFilter):
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
         return jnp.kron(rows.T, move), move, noise, centre, rows
 
-    def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the output matrix of zeta less the mean output, Cov(z - E[z | zeta]), and the mean output."""
+    def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, ...]:
+        """Return the output matrix of zeta less the mean output, Cov(z - E[z | zeta]), mean output, rounding of z."""
         channel = at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
         law = state.moments[:, -1, -1]
         second = measure @ state.moments @ measure.T + law[:, None, None] * noise
-        added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
-        added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
+        random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
+        added = random + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
         observed, common = without_common(gains @ measure, law)
-        return joined(observed), added, common
+        return joined(observed), added, common, self.rounding(gains, random, k)
 
-    def smoother_step(
-        self,
-        before: ModalBelief,
-        prior: ModalBelief,
-        after: ModalBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the linear update of zeta."""
-        output, _, _ = self._observe(prior, k)
-        step, move, noise, _, rows = self._moves(before, u, k)
-        return linear_smoother_step(
-            after,
-            prior,
-            step,
-            _spread_of_moves(before.moments, move, noise, rows)[1],
-            output,
-            innovation.value,
-            innovation.covariance,
-            self.claim,
-            self._projection(),
-        )
+        output = self._observe(step.prior, step.k)[0]
+        transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
+        process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
+        return linear_smoother_step(step, (transition, process, output), self.claim, self._projection())
 
 
 def _spread_of_moves(
@@ -193,9 +190,13 @@ def linear_observation(
     received: Float[jax.Array, "m N"],
     added: Float[jax.Array, "m m"],
     expected: Float[jax.Array, " m"],
+    rounded: Float[jax.Array, " m"],
     z: ArrayLike,
 ) -> tuple[jax.Array, jax.Array, Innovation]:
-    """Posterior mean and covariance of zeta given the components of z that arrived, with Cov(z | zeta) = `added`."""
+    """Posterior mean and covariance of zeta given the components of z that arrived.
+
+    Cov(z | zeta) is `added`, and the variance that rounding gives to each component `rounded`.
+    """
     z = jnp.asarray(z)
     present = ~jnp.isnan(z)
     both = present[:, None] & present
@@ -208,8 +209,17 @@ def linear_observation(
         jnp.where(both, total, 0.0) + absent(present),
         jnp.where(present[:, None], received, 0.0),
         jnp.where(both, added, 0.0) + absent(present),
+        jnp.where(present, rounded, 0.0),
     )
     return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
+
+
+def mean_rounding(start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array) -> jax.Array:
+    """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
+    n, size = len(start.initial_mean), initial_size(start)
+    projection = sum_of_modes(n, len(law))
+    left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
+    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size) - left))
 
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -317,5 +327,4 @@ def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
 
 def claim_of_modes(channel: Channel) -> Claim:
     """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
-    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
-    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"
+    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"

@@ -9,18 +9,17 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.precise import above_rounding, initial_size
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
-from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, within_range
+from heliograph.filters.linear.linear import LinearBelief, corrected_linear, moved, within_range
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import OverTime, at, first, unstack
+from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -91,12 +90,11 @@ class ModeObservedFilter(AbstractSizedFilter):
         z, published = observed[:m], observed[m:]
         known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        size, rule = initial_size(at(self.plant, 0)), Polytope()
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
             then = _given(at(self.channel, last), certain)
-            redone = _use(state.before, at(self.sensor, last), then, state.z, size)[0]
+            redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, size)
             redone = _over(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
@@ -105,8 +103,8 @@ class ModeObservedFilter(AbstractSizedFilter):
             prior, described = state.belief, _given(channel, certain)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(known, z, jnp.nan)
-        after, expected, covariance = _use(prior, sensor, described, usable, size)
-        innovation = gaussian_innovation(z, expected, covariance)
+        after, innovation = corrected_linear(prior, sensor, described, rule, z, size)
+        after = jax.tree.map(lambda a, b: jnp.where(known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
         for item in published:
@@ -126,21 +124,6 @@ def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
     pairs = ((belief.mean, belief.covariance), (belief.state_mean, belief.state_covariance))
     error, local = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
     return LinearBelief(*error, *within_range(*local))
-
-
-def _use(
-    prior: LinearBelief, sensor: LinearSensor, described: SecondOrder, z: jax.Array, size: jax.Array
-) -> tuple[LinearBelief, jax.Array, jax.Array]:
-    """Return the updated belief, the expected measurement and the innovation covariance."""
-    of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
-    noise = jnp.asarray(sensor.noise.covariance)
-    y = signal(prior[1:], *of, noise)._replace(matrix=of[0], noise=noise)
-    gain, bound = Polytope().correct(prior.covariance, y, described, ~jnp.isnan(z))
-    bound = above_rounding(bound, prior.covariance, size)
-    through = jnp.asarray(described.mean_gain), jnp.asarray(described.offset)
-    mean, covariance, expected = used(prior.mean, prior.covariance, gain, bound, *of, *through, z)
-    after = LinearBelief(mean, covariance, prior.state_mean, prior.state_covariance)
-    return after, expected, jnp.asarray(innovation_covariance(y, described))
 
 
 def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
@@ -210,8 +193,7 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Mo
 def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
     check_linear("filter that observes the mode", plant, sensor)
     # Erasures are side information of another kind.
-    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
-    if any(step.erases for step in steps if isinstance(step, AbstractRandomAffine)):
+    if any(step.erases for step in unstack(channel) if isinstance(step, AbstractRandomAffine)):
         expected = "a channel without erasures (side_information_filter with flags=np.eye(modes) takes them)"
         raise fail("filter that observes the mode", expected, "one that loses packets")
     # Received: z and one number per memory.

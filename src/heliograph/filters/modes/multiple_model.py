@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import corrected, signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -20,10 +20,8 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import mixed_innovation
 from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.filters.smoother_step.building import moments_smoother_step
-from heliograph.model.angle import received_angles
-from heliograph.model.channel import Channel, check_link
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -81,13 +79,8 @@ def receive(
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
-    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step if it varies.
-
-    Raises:
-        ValueError: too many modes, maps whose moments are unknown, a mode whose output is certain among others: a
-            probability cannot be weighed against densities.
-    """
-    steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    """Return the initial law of the modes, and the channel by mode and pattern of arrivals, at each step."""
+    steps = [joint_modes(c, nodes) for c in unstack(channel)]
     no_flags = np.ones((len(steps[0].initial), 1))
     parts = by_pattern(steps, no_flags)
     for part in parts if len(no_flags) > 1 else []:
@@ -217,8 +210,8 @@ class MultipleModelFilter(AbstractSizedFilter):
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        start, chance = at(self.plant, 0), state.weight[i, j]
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        chance = state.weight[i, j]
+        size = initial_size(at(self.plant, 0))
         after, weight, mixed = receive(belief, signal, channel, jnp.asarray(j), chance, z, size, self.observed_angles)
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
         (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
@@ -230,20 +223,9 @@ class MultipleModelFilter(AbstractSizedFilter):
         whole = _whole(state)
         return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
 
-    def smoother_step(
-        self,
-        before: ModalBeliefs,
-        prior: ModalBeliefs,
-        after: ModalBeliefs,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of the whole mixture around the update; modes are not smoothed."""
-        local = _whole(before)
-        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
-        return moments_smoother_step(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
+        return moments_around(self, step, _whole)
 
 
 def _whole(state: ModalBeliefs) -> Belief:
@@ -263,9 +245,6 @@ def link_by_mode(
     """Return the plant at the start, received angles, the modes' initial law, and the channel by mode.
 
     A gain that drifts has `nodes` modes.
-
-    Raises:
-        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
     """
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))

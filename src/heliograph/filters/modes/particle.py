@@ -83,8 +83,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
-        start = at(self.plant, 0)
-        size = initial_size(start.initial_mean, start.initial_covariance)
+        size = initial_size(at(self.plant, 0))
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
 
         after, weight, mixed = receive(

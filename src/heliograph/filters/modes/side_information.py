@@ -12,7 +12,15 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predict
 from heliograph.filters.gaussian.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import pseudo_solve
-from heliograph.filters.modes.modal import joined, measured_about, moved_about, padded, sum_of_modes, without_common
+from heliograph.filters.modes.modal import (
+    joined,
+    mean_rounding,
+    measured_about,
+    moved_about,
+    padded,
+    sum_of_modes,
+    without_common,
+)
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
@@ -21,11 +29,12 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import spread_of, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import symmetric_product
-from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 
 
 class SideInformation(Module):
@@ -79,8 +88,9 @@ class SideInformationFilter(AbstractSizedFilter):
     Its measurement is z and, where there are `flags`, the number of the flag after it; the likelihood is that of z
     given these. Losses that the channel does not model must not depend on the modes. Moments are those of x - E[x], and
     the error has moments of its own: a mean far from zero costs no digits, and with one mode no precise measurement
-    does. With several, x is the sum of its parts in each: a variance below 1e-15 of the state's is rounding, of either
-    sign.
+    does. With several, x is the sum of its parts in each. What the products of moments leave of rounding, eps |F|^2 of
+    the deviations, is added to the error's variances, and after a precise measurement that of the mean: so that what is
+    claimed is never less than nothing, and no data without noise take it to where rounding decides.
 
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
@@ -117,7 +127,7 @@ class SideInformationFilter(AbstractSizedFilter):
         chosen = jnp.einsum("ijl,ab->ijlab", jnp.eye(modes) - rows[:, None], jnp.eye(size))
         change = jnp.broadcast_to(jnp.eye(len(whole)), (modes, modes, *whole.shape))
         change = change.at[:, :, -len(step) :, :size].set(chosen.reshape(modes, modes, -1, size))
-        carried = change @ (whole @ state.moments @ whole.T)[:, None] @ change.swapaxes(2, 3)
+        carried = _turned(change @ whole, state.moments[:, None], len(step))
         # Process noise, in x~ and in the error of mode j.
         fresh = _stacked(jnp.eye(size), jnp.zeros((len(step), size)), _deviations(modes, size))
         moments = jnp.einsum("ij,ijab->jab", rows, carried)
@@ -142,10 +152,14 @@ class SideInformationFilter(AbstractSizedFilter):
         total = weight @ state.moments[:, size - 1, size - 1]
         moments = weight[:, None, None] * state.moments / total
         prior = _projected(state._replace(moments=moments), size)
-        # Kalman update of zeta with the components that arrived.
+        # Kalman update of zeta with the components that arrived, and the rounding of the mean.
         after, value, covariance = _used(
             prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there
         )
+        law = after.moments[:, size - 1, size - 1]
+        shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance)
+        errors = slice(-len(after.mean), None)
+        after = after._replace(moments=after.moments.at[:, errors, errors].add(law[:, None, None] * shares))
         likelihood = log_density(value, covariance, jnp.abs(z) + jnp.abs(value))
         covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
         if self.flagged:
@@ -173,13 +187,26 @@ def _stacked(x: jax.Array, s: jax.Array, e: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.broadcast_to(both, (len(e), *both.shape)), e], axis=1)
 
 
+def _turned(change: jax.Array, moments: jax.Array, errors: int) -> jax.Array:
+    """F E[r r'] F' (..., r, r), and of each of the last variances, the errors', the rounding of these products."""
+    turned = change @ moments @ jnp.swapaxes(change, -1, -2)
+    rounded = _rounding(jnp.abs(change[..., -errors:, :]), moments)
+    return turned.at[..., -errors:, -errors:].add(jnp.eye(errors) * rounded[..., None])
+
+
+def _rounding(size: jax.Array, moments: jax.Array) -> jax.Array:
+    """Four eps of (|F| d)^2, d the deviations (..., m): what the products of F E[r r'] F' may be off."""
+    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(moments, axis1=-2, axis2=-1), 0.0))
+    return 4 * float(np.finfo(moments.dtype).eps) * (size @ deviation[..., None])[..., 0] ** 2
+
+
 def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
     """Best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
     count, total = len(state.mean), jnp.sum(state.moments, axis=0)
     known = slice(size - 1, size + count)
     change = pseudo_solve(total[known, known], total[known, -count:]).T
     turn = jnp.eye(len(total)).at[size:-count, known].add(change).at[-count:, known].add(-change)
-    moments = turn @ state.moments @ turn.T
+    moments = _turned(turn, state.moments, count)
     return state._replace(mean=state.mean + change @ jnp.append(1.0, state.mean), moments=moments)
 
 
@@ -202,16 +229,18 @@ def _used(
     output, common = without_common(mean @ measure, law)
     output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
     prior = state.covariance
-    # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1.
+    # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1, with the rounding of S, which no difference of modes is below.
     cross, value = output @ prior, z - common - output @ state.mean
     total = cross @ output.T + jnp.sum(added, axis=0)
-    seen = jnp.where(there[:, None] & there, total, 0.0) + absent(there)
+    rounded = jnp.diag(_rounding(jnp.abs(output), prior))
+    seen = jnp.where(there[:, None] & there, symmetrize(total) + rounded, 0.0) + absent(there)
     gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
     both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
     # s+ = s + K (H e + noise), e+ = e - K (H e + noise).
     change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ output)
-    moments = change @ state.moments @ change.T
-    moments = moments.at[:, size:, size:].add(both @ added @ both.T)
+    moments = _turned(change, state.moments, len(prior))
+    noise_of = jax.vmap(spread_of, in_axes=(None, 0))(gain, added)
+    moments = moments.at[:, size:, size:].add(jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), noise_of))
     after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
     return after, value, total
 
@@ -256,7 +285,7 @@ def side_information_filter(
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     # P(flag | mode); one flag that is always the same where there are none.
-    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(c) for c in unstack(channel)]
     modes = len(steps[0].initial)
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):

@@ -24,7 +24,7 @@ from heliograph.filters.modes.modal import (
     prior_of_modes,
     without_common,
 )
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
@@ -101,29 +101,25 @@ class UncertainModalFilter(AbstractModalFilter):
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
-        items = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
-        added = _worst(items, *_middle(state.low, state.high))
+        random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
+        added = _worst(random + gains @ noise @ gains.swapaxes(1, 2), *_middle(state.low, state.high))
         output, common = without_common(gains @ measure, state.law)
         observed = joined(output)
         expected = common + observed @ (state.mean - known_part(state.law, state.centre))
-        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
+        rounded = self.rounding(gains, jnp.max(random, axis=0), k)
+        mean, covariance, innovation = linear_observation(
+            state.mean, state.covariance, observed, added, expected, rounded, z
+        )
+        covariance = self.above_rounding(covariance, state.covariance, state.law)
         return state._replace(mean=mean, covariance=covariance), innovation
 
-    def smoother_step(
-        self,
-        before: UncertainBelief,
-        prior: UncertainBelief,
-        after: UncertainBelief,
-        innovation: Innovation,
-        z: ArrayLike,
-        u: ArrayLike,
-        k: Step,
-    ) -> AbstractSmootherStep:
+    def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return the moments of zeta around the update; the filter's bound is not proved for smoothed estimates."""
-        move, _, _ = moved_about(at(self.plant, k), u, before.centre)
+        before, k = step.before, step.k
+        move, _, _ = moved_about(at(self.plant, k), step.u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
-        moments = moments_smoother_step(after, prior, cross, "nominal")
+        moments = moments_smoother_step(step.after, step.prior, cross, "nominal")
         return replace(moments, projection=jnp.asarray(self._projection()))
 
 

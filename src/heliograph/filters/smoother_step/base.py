@@ -6,13 +6,14 @@ with `estimate_from`; `ahead` carries one earlier state forward instead.
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.linalg import (
     congruence,
@@ -30,7 +31,7 @@ from heliograph.numerics.linalg import (
 )
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
-from heliograph.numerics.types import Bool, Float, PyTree
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int, PyTree
 
 
 class Moments(NamedTuple):
@@ -54,6 +55,21 @@ class Point(NamedTuple):
     precise: Bool[jax.Array, ""]
 
 
+class StepTrace(NamedTuple):
+    """States of a filter around step k: `before` it, `prior` after the prediction, `after` the correction with z.
+
+    Also the innovation of the correction, the measurement z (received,) and the input u (inputs,).
+    """
+
+    before: PyTree
+    prior: PyTree
+    after: PyTree
+    innovation: Innovation
+    z: ArrayLike
+    u: ArrayLike
+    k: int | np.integer | Int[jax.Array, ""]
+
+
 class AbstractSmootherStep(Module):
     """Smoother step: the estimate after a step, of the filter's state of N numbers, and what a backward pass needs.
 
@@ -64,17 +80,21 @@ class AbstractSmootherStep(Module):
     estimates; a backward pass never wraps them. nis: e' S^-1 e of the step's innovation, with mean `received`, the
     number of components that arrived.
 
+    prior_mean, prior_covariance: of the state before the correction.
+
     Shapes: mean (N,), covariance (N, N), projection (n, N), shift (n,).
     """
 
     mean: Float[jax.Array, "*time N"]
     covariance: Float[jax.Array, "*time N N"]
-    projection: Float[jax.Array, "*time n N"] | None
-    shift: Float[jax.Array, "*time n"] | None
-    nis: Float[jax.Array, "*time"] | None
-    received: Float[jax.Array, "*time"] | None
-    claim: Claim = eqx.field(static=True)
-    angles: Angles = eqx.field(static=True)
+    prior_mean: Float[jax.Array, "*time N"]
+    prior_covariance: Float[jax.Array, "*time N N"]
+    projection: Float[jax.Array, "*time n N"] | None = eqx.field(default=None, kw_only=True)
+    shift: Float[jax.Array, "*time n"] | None = eqx.field(default=None, kw_only=True)
+    nis: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
+    received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
+    claim: Claim = eqx.field(static=True, kw_only=True)
+    angles: Angles = eqx.field(static=True, default=(), kw_only=True)
 
     def end(self) -> PyTree:
         """Start a backward pass at this step, the last."""
@@ -105,13 +125,14 @@ class AbstractSmootherStep(Module):
         nothing = jnp.zeros_like(self.covariance)
         return Point(self.mean, self.covariance, unit, nothing, self.covariance, jnp.asarray(False))
 
-    def without_data(self) -> "AbstractSmootherStep":
+    def without_data(self) -> Self:
         """Return the same step without the parts that only means depend on."""
-        raise NotImplementedError
+        none = jnp.zeros_like(self.mean)
+        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
 
-    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractSmootherStep":
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:
         """Return the same step with other data of the same arrivals: other means and innovation."""
-        raise NotImplementedError
+        return replace(self, mean=mean, prior_mean=prior_mean)
 
     def estimate_from(self, result: Moments | Point) -> Estimate:
         """Estimate of the plant's state from the filter's."""
@@ -167,8 +188,6 @@ class LinearSmootherStep(AbstractSmootherStep):
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
     """
 
-    prior_mean: Float[jax.Array, "*time N"]
-    prior_covariance: Float[jax.Array, "*time N N"]
     precise: Bool[jax.Array, "*time"]
     transition: Float[jax.Array, "*time N N"]
     process: Float[jax.Array, "*time N N"]
@@ -222,12 +241,11 @@ class LinearSmootherStep(AbstractSmootherStep):
         mean = _mean_before(item.mean, earlier.vector, known.mean - self.prior_mean, *step)
         return Moments(mean, _left(earlier.matrix, self.process, known.covariance, *step))
 
-    def without_data(self) -> AbstractSmootherStep:
-        """Return the step without mean and innovation."""
-        mean, innovation = jnp.zeros_like(self.mean), jnp.zeros_like(self.innovation)
-        return replace(self, mean=mean, prior_mean=mean, innovation=innovation, shift=None, nis=None, received=None)
+    def without_data(self) -> Self:
+        """Return the step without means and innovation."""
+        return replace(super().without_data(), innovation=jnp.zeros_like(self.innovation))
 
-    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:
         """Return the step with these means and innovation."""
         return replace(self, mean=mean, prior_mean=prior_mean, innovation=innovation)
 

@@ -13,6 +13,7 @@ from heliograph.filters.smoother_step.base import (
     LinearSmootherStep,
     Moments,
     Point,
+    StepTrace,
     applied,
     less,
 )
@@ -42,8 +43,6 @@ class MomentsSmootherStep(AbstractSmootherStep):
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
 
-    prior_mean: Float[jax.Array, "*time N"]
-    prior_covariance: Float[jax.Array, "*time N N"]
     cross: Float[jax.Array, "*time N N"]
 
     def end(self) -> Moments:
@@ -66,15 +65,6 @@ class MomentsSmootherStep(AbstractSmootherStep):
         news = applied(gain, self.mean - self.prior_mean)
         after = less(point.covariance, gain, self.prior_covariance - self.covariance)
         return point._replace(mean=point.mean + news, covariance=after, link=gain)
-
-    def without_data(self) -> AbstractSmootherStep:
-        """Return the step without both means."""
-        none = jnp.zeros_like(self.mean)
-        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
-
-    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
-        """Return the step with these means."""
-        return replace(self, mean=mean, prior_mean=prior_mean)
 
     def _gain(self) -> jax.Array:
         return _solved(self.prior_covariance, self.cross)
@@ -113,40 +103,24 @@ def moments_smoother_step(
     after: HasMoments, prior: HasMoments, cross: Array, claim: Claim, angles: Angles = ()
 ) -> MomentsSmootherStep:
     """Build the step from the states after and before a correction, and Cov(x before the step, x predicted)."""
-    return MomentsSmootherStep(
-        mean=jnp.asarray(after.mean),
-        covariance=jnp.asarray(after.covariance),
-        prior_mean=jnp.asarray(prior.mean),
-        prior_covariance=jnp.asarray(prior.covariance),
-        cross=jnp.asarray(cross),
-        claim=claim,
-        projection=None,
-        shift=None,
-        nis=None,
-        received=None,
-        angles=angles,
-    )
+    moments = after.mean, after.covariance, prior.mean, prior.covariance, cross
+    return MomentsSmootherStep(*map(jnp.asarray, moments), claim=claim, angles=angles)
 
 
 def linear_smoother_step(
-    after: HasMoments,
-    prior: HasMoments,
-    transition: Array,
-    process: Array,
-    output: Array,
-    innovation: Array,
-    total: Array,
+    step: StepTrace,
+    model: tuple[Array, Array, Array],
     claim: Claim,
     projection: Array | None = None,
     solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> LinearSmootherStep:
-    """Build the step from the states after and before a correction, A, Q, H, e, and S.
+    """Build the step from the states around a correction, its innovation e and S, and A, Q and H of the `model`.
 
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
     component that others determine is left out.
     """
-    spread = jnp.asarray(prior.covariance)
-    given = spread, jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    spread, (transition, process, output) = jnp.asarray(step.prior.covariance), map(jnp.asarray, model)
+    given = spread, output, jnp.asarray(step.innovation.covariance), jnp.asarray(step.innovation.value)
     # H' S^-1 and K = P- H' S^-1 of the components that arrived.
     if solve is None:
         gain, weigh, received, arrived, innovation = _parts(*given)
@@ -155,23 +129,19 @@ def linear_smoother_step(
         weigh = solve(arrived, received).T
         gain = spread @ weigh
     return LinearSmootherStep(
-        mean=jnp.asarray(after.mean),
-        covariance=jnp.asarray(after.covariance),
-        prior_mean=jnp.asarray(prior.mean),
+        mean=jnp.asarray(step.after.mean),
+        covariance=jnp.asarray(step.after.covariance),
+        prior_mean=jnp.asarray(step.prior.mean),
         prior_covariance=spread,
         precise=_precise(spread, received, arrived),
-        transition=jnp.asarray(transition),
-        process=jnp.asarray(process),
+        transition=transition,
+        process=process,
         gain=gain,
         output=received,
         weigh=weigh,
         innovation=innovation,
         claim=claim,
         projection=None if projection is None else jnp.asarray(projection),
-        shift=None,
-        nis=None,
-        received=None,
-        angles=(),
     )
 
 

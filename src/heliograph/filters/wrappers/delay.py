@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,9 +15,9 @@ from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
+from heliograph.model.enlarged import with_past
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
-from heliograph.model.past import with_past
+from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
@@ -24,11 +25,9 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
-from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
-from heliograph.random_affine.combine import Series
-from heliograph.random_affine.delay import Delayed, of_line, sent
-from heliograph.random_affine.in_line import Relayed
+from heliograph.random_affine.combine import Series, known
+from heliograph.random_affine.delay import Delayed, Relayed, of_line, sent
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.random_affine.noise import Gaussian, Independent
 
@@ -156,11 +155,7 @@ def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, plac
 def with_relays(
     plant: AnyPlant, sensor: AnySensor, channel: Relayed
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
-    """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places.
-
-    Raises:
-        ValueError: a plant or sensor that is not linear, links with memory.
-    """
+    """Enlarge the plant by all lines of past signals; return it with sensor, last link, and each relay's places."""
     for stage in channel.stages:
         check_forgets("link of a relay that is late by chance", stage)
     # The sensor's line, then one line per relay behind it.
@@ -171,10 +166,7 @@ def with_relays(
         lines.append((start, stage.inputs, total))
         start = total
         total += later.inputs
-        if isinstance(moved, OverTime):
-            moved = over_time([_holding(item, i, stage.outputs, later.past) for item in unstack(moved)])
-        else:
-            moved = _holding(moved, i, stage.outputs, later.past)
+        moved = at_each_step(partial(_holding, relay=i, size=stage.outputs, steps=later.past), moved)
     # The receiver sees the line of the last relay.
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
     return moved, last, of_line(channel.stages[-1]), tuple(lines)
@@ -197,11 +189,7 @@ def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
 
 
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
-    """Build the filter behind relays from `base`, the filter of all lines.
-
-    Raises:
-        ValueError: relays' links with uncertain probabilities.
-    """
+    """Build the filter behind relays from `base`, the filter of all lines."""
     # Only the moments under known probabilities make the filter optimal.
     links = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
@@ -367,12 +355,12 @@ def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
 
 def as_current(channel: Channel) -> Channel:
     """Return the channel for a filter that takes late signals as current: all signals of its line are y_k."""
-    if isinstance(channel, OverTime):
-        return over_time([as_current(item) for item in unstack(channel)])
-    return _at_once(as_maps("channel", [channel])[0])
+    current: Channel = at_each_step(_at_once, channel)
+    return current
 
 
 def _at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    as_maps("channel", [channel])
     if isinstance(channel, Relayed):
         return Series([_at_once(stage) for stage in channel.stages])
     return Series([known(np.tile(np.eye(sent(channel)), (1 + channel.past, 1))), of_line(channel)])

@@ -129,7 +129,7 @@ class FedBackFilter(AbstractSizedFilter):
         y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
-        size = initial_size(base.initial_mean, base.initial_covariance)
+        size = initial_size(base)
         after, innovation = corrected(prior, sent, at(base.channel, k), base.rule, jnp.asarray(z), size)
         return FedBackBelief(*after, state.reference), innovation
 

@@ -4,21 +4,21 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import chosen
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
-from heliograph.filters.linear.linear import LinearFilter, linear_filter
+from heliograph.filters.linear.linear import linear_filter
+from heliograph.filters.rows import over_rows
 from heliograph.learning.description import Description
-from heliograph.learning.likelihood import steady_gains
 from heliograph.model.channel import Channel, parallel
-from heliograph.model.clock import joint_sensor
+from heliograph.model.enlarged import joint_sensor
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail
@@ -26,7 +26,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import solve
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
 from heliograph.random_affine.noise import Independent
@@ -66,9 +66,8 @@ def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    if isinstance(channel, OverTime):
-        return over_time([arrived(item) for item in unstack(channel)])
-    return arrived(channel)
+    result: Channel = at_each_step(arrived, channel)
+    return result
 
 
 Form = Literal["linear", "conditional"]
@@ -83,11 +82,6 @@ class Data(NamedTuple):
     measurements: Float[np.ndarray, "recordings steps received"]
     inputs: Float[np.ndarray, "recordings steps inputs"]
     lengths: tuple[int, ...]
-
-    @property
-    def plain(self) -> bool:
-        """True if everything arrived, and there are no inputs."""
-        return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
 class Evaluation(NamedTuple):
@@ -131,14 +125,10 @@ class Objective:
     Args:
         description: the network with its free numbers.
         form: "linear" or "conditional".
-        steady: true for a `LinearFilter` of which nothing varies over time, so that its gains reach a steady state.
-        random: true if gains are random, so that gains of the filter depend on the state's second moment.
     """
 
     description: Description
     form: Form
-    steady: bool
-    random: bool
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Objective) and same(self._parts(), other._parts())
@@ -155,17 +145,9 @@ class Objective:
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
-        item = self.filter(x)
-
-        def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
-            k, z_k, u_k = row
-            after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
-            return after, (jnp.asarray(innovation.value), jnp.asarray(innovation.covariance))
-
-        start = jax.tree.map(jnp.asarray, item.init())
-        result: tuple[jax.Array, jax.Array] = jax.lax.scan(
-            body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u))
-        )[1]
+        result: tuple[jax.Array, jax.Array] = over_rows(
+            self.filter(x), z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
+        )
         return result
 
 
@@ -179,9 +161,7 @@ def objectives(network: Description) -> list[Objective]:
     Raises:
         ValueError: a network whose likelihood no filter here knows.
     """
-    built = network.start
-    forms, steady = forms_of(built), _is_steady(built)
-    return [Objective(network, form, steady and form == "linear", len(forms) > 1) for form in forms]
+    return [Objective(network, form) for form in forms_of(network.start)]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -198,13 +178,6 @@ def forms_of(network: Network) -> list[Form]:
     return ["linear", "conditional"]
 
 
-def _is_steady(network: Network) -> bool:
-    """Decide whether the linear filter is one without memory or delay, of which nothing varies over time."""
-    world = joint_world(network)
-    item = first(world[2])
-    return not item.remembers and not item.past and not any(isinstance(part, OverTime) for part in world)
-
-
 def filter_of(network: Network, form: Form) -> AbstractFilter:
     """Filter of all that the network's nodes receive, whose likelihood is of this form."""
     plant, sensor, channel = joint_world(network)
@@ -213,83 +186,56 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
     return cubature_filter(plant, sensor, without_memory(channel))
 
 
-def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
-    """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
-
-    Where gains reach a steady state, one at a time: there is enough to do in parallel within a recording.
-    """
-    every: dict[int, Evaluation] = {}
+def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
+    """Likelihood, scores and information at points of the line: native code, all points side by side, or XLA."""
     with jax.enable_x64(True):
-        for i, point in enumerate(x if objective.steady and data.plain else ()):
-            result, converged = to_numpy(_with_steady_gains(objective, point, data.measurements))
-            if converged:
-                every[i] = result
-        left = [i for i in range(len(x)) if i not in every]
-        for begin in range(0, len(left), lanes):
-            places = left[begin : begin + lanes]
-            full = x[places + places[-1:] * (lanes - len(places))]
-            result = to_numpy(_at_points(objective, full, data.measurements, data.inputs))
-            every |= {i: Evaluation(*(leaf[lane] for leaf in result)) for lane, i in enumerate(places)}
-    return Evaluation(*(np.stack(item) for item in zip(*(every[i] for i in range(len(x))), strict=True)))
+        parts = [_at_points(objective, x, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
+    density, score, halves = zip(*parts, strict=True)
+    return Evaluation(np.stack(density, axis=1), np.stack(score, axis=1), np.sum(halves, axis=0))
 
 
-@quickly_compiled
-def _at_points(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    evaluation: Evaluation = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
-    return evaluation
-
-
-@quickly_compiled
-def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evaluation, jax.Array]:
-    def numbers(x: Array) -> PyTree:
-        return eqx.filter(objective.filter(x), eqx.is_inexact_array)
-
-    item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
-    slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
-    assert isinstance(item, LinearFilter)  # as of every steady objective
-    received, derivatives, converged = steady_gains.innovations(item, slopes, z, objective.random)
-    scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
-    result = Evaluation(
-        *scored(received.value, received.covariance, derivatives.value, derivatives.covariance, jnp.asarray(z))
-    )
-    return result._replace(halves=jnp.sum(result.halves, axis=0)), converged
-
-
-def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """Evaluation at one point: density (recordings, steps), score (recordings, steps, p), halves (2, p, p)."""
-    result = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
-    return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
+def _at_points(objective: Objective, x: np.ndarray, z: np.ndarray, u: np.ndarray) -> Evaluation:
+    """Evaluate one recording at points, (points, ...)."""
+    choice = chosen(one_recording, (objective, x, z, u), [False, True, False, False])
+    if choice.code is not None:
+        return choice.results()  # type: ignore[no-any-return]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *(to_numpy(_by_xla(objective, point, z, u)) for point in x))  # type: ignore[no-any-return]
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p).
-
-    s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
-    components that arrived; derivatives run forward through the scan.
-    """
+    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward."""
     local = partial(objective.innovations, z=z, u=u)
-    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
-    return Evaluation(*_scored(e, s, de, ds, jnp.asarray(z)))
+    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 1))(jnp.eye(len(x)))
+
+    def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        k, *innovation = row
+        density, score, information = _scored(*innovation)
+        late = jnp.stack([k < len(z) // 2, k >= len(z) // 2])[:, None, None]
+        return halves + jnp.where(late, information, 0.0), (density, score)
+
+    rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z)
+    halves, (density, score) = jax.lax.scan(step, jnp.zeros((2, len(x), len(x))), rows)
+    return Evaluation(density, score, halves)
+
+
+_by_xla = quickly_compiled(one_recording)
 
 
 def _scored(
     e: jax.Array, s: jax.Array, de: jax.Array, ds: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    p, steps, m = de.shape
-    e, z, s = e.T, z.T[:m], jnp.moveaxis(s, 0, -1)  # time last, as the kernels of small matrices want it
-    de, ds = jnp.moveaxis(de, (0, 1), (1, 2)), jnp.moveaxis(ds, (0, 1), (2, 3))
-    # components that arrived, and the log-density of their innovation
+    """Log-density, score and information of an innovation e (m,) and its covariance, with derivatives (p, ...).
+
+    -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2 and de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, of what arrived.
+    """
+    p, m = de.shape
     present = ~jnp.isnan(e)
     both = present[:, None] & present
-    density = log_density(e, s, jnp.abs(z) + jnp.abs(z - e))
+    density = log_density(e, s, jnp.abs(z[:m]) + jnp.abs(z[:m] - e))
     e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
-    de, ds = jnp.where(present[:, None], de, 0.0), jnp.where(both[:, :, None], ds, 0.0)
-    # S^-1 (e, de, dS) by one factorisation, then score and information
-    right = jnp.concatenate([e[:, None], de, jnp.reshape(jnp.swapaxes(ds, 1, 2), (m, p * m, steps))], axis=1)
-    solved = solve(s, right)
-    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m, steps)  # S^-1 (e, de, dS)
-    score = jnp.einsum("iak,ik->ka", -de, w) - jnp.einsum("iaik->ka", q) / 2
-    score = score + jnp.einsum("ik,ijak,jk->ka", w, ds, w) / 2
-    late = jnp.stack([jnp.arange(steps) < steps // 2, jnp.arange(steps) >= steps // 2]).astype(e.dtype)
-    halves = jnp.einsum("hk,iak,ibk->hab", late, de, v) + jnp.einsum("hk,iajk,jbik->hab", late, q, q) / 2
-    return density, score, halves
+    de, ds = jnp.where(present, de, 0.0), jnp.where(both, ds, 0.0)
+    # S^-1 (e, de, dS) by one factorisation
+    solved = solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))
+    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
+    score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
+    return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2

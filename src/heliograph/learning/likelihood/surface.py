@@ -9,8 +9,6 @@ from heliograph.learning.likelihood.maximise import Evaluated, Maximum, maximise
 from heliograph.learning.likelihood.objective import Data, Evaluation, Objective, at_points
 from heliograph.numerics.types import Bool, Float
 
-LANES = 8  # points at a time
-ROOM = 2.5e7  # numbers that those may take with their derivatives: 200 MB
 DIFFERENCE = 1e-3  # standard errors over which scores are differenced
 REACH = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.5, 7.0])  # standard errors at which a profile is cut first
 REFINEMENTS = 2
@@ -34,17 +32,10 @@ class Surface:
     data: Data
     _last: list[tuple[np.ndarray, Evaluation]] = field(default_factory=list, repr=False, compare=False)
 
-    @property
-    def lanes(self) -> int:
-        """Number of points evaluated together, fewer for long recordings."""
-        r, t, m = self.data.measurements.shape
-        p = self.objective.description.parameters.size
-        return int(np.clip(ROOM // (r * t * m * (m + 2) * (p + 1)), 1, LANES))
-
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Evaluation at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
-            self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
+            self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data))]
         return self._last[0][1]
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:

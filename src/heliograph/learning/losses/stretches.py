@@ -44,15 +44,15 @@ def fates_of_sequence(
         when = array("times of sending", sent, received.shape)
         received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
     # a new stretch at each restart, copies dropped
-    parts: list[list[int]] = [[]]
+    stretches: list[list[int]] = [[]]
     for number in received.tolist():
-        local = parts[-1]
-        if sent is None and number in local[-COPY:]:
+        stretch = stretches[-1]
+        if sent is None and number in stretch[-COPY:]:
             continue
-        if local and (number <= local[-1] or number - local[-1] >= jump):
-            parts.append([])
-        parts[-1].append(number)
-    return [_gaps(np.array(part)) for part in parts]
+        if stretch and (number <= stretch[-1] or number - stretch[-1] >= jump):
+            stretches.append([])
+        stretches[-1].append(number)
+    return [_gaps(np.array(part)) for part in stretches]
 
 
 def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:

@@ -29,9 +29,9 @@ from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain, stationary
 from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
 from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
-from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Common, Node
 

@@ -14,9 +14,8 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.paths.information_filter import Plants
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.transmitters import sent_powers, transmits
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -4,12 +4,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, AbstractWithBase, as_maps, check_forgets
-from heliograph.random_affine.moments.moments import Moments
 from heliograph.random_affine.moments.monomials import (
+    Moments,
     count,
     exponents,
     monomials,

@@ -9,10 +9,14 @@ from itertools import combinations_with_replacement, product
 from math import comb, prod
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.traced import placed
+from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
 
@@ -44,11 +48,7 @@ def count(variables: int, degree: int) -> int:
 
 
 def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
-    """Raise if a moment matrix would need more than the stated memory.
-
-    Raises:
-        ValueError: naming the number of entries and what to do.
-    """
+    """Raise if a moment matrix would need more than the stated memory."""
     if rows * columns > MEMORY_LIMIT_ENTRIES:
         got = f"{rows * columns:,} entries; use a lower order, or fewer states, outputs or stacked sensors at once"
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
@@ -148,3 +148,42 @@ def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.nda
             terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
     rows, columns, noises, weights = np.array(terms, dtype=np.int64).T
     return rows, columns, noises, weights
+
+
+class Moments(Module):
+    """Joint moments of (G, n) of one order: the matrix E[Sym^k(H)].
+
+    It takes the monomials of (y, 1) of degree k to the conditional expectations of those of (z, 1),
+    E[mono_k(z) | y] = matrix mono_k(y). A map in series is the product of the matrices.
+
+    Shapes: matrix (C(outputs + k, k), C(inputs + k, k)).
+    """
+
+    matrix: Float[jax.Array | np.ndarray, "rows columns"]
+    outputs: int = eqx.field(static=True)
+    inputs: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+
+    @property
+    def mean(self) -> Float[jax.Array | np.ndarray, "outputs+1 inputs+1"]:
+        """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
+        return self.lower(1)
+
+    def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
+        """E[Sym^order(H)] of a lower order, whose monomials are among these."""
+        matrix: jax.Array | np.ndarray = self.matrix[_among(self.outputs, self.inputs, self.order, order)]
+        return matrix
+
+    def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
+        """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
+        return self.matrix @ y_moments
+
+
+@cache
+def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
+    """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
+    items = [
+        [i for i, powers in enumerate(exponents(size + 1, high)) if powers[-1] >= high - low]
+        for size in (outputs, inputs)
+    ]
+    return np.ix_(*items)

@@ -10,13 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, plain, stacked
-from heliograph.random_affine.atoms import GainAndNoise, gain_moments, homogeneous
+from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Mixture, Series
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, gain_moments, homogeneous
 from heliograph.random_affine.moments.monomials import (
     Exponents,
     count,
@@ -40,9 +39,6 @@ def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
-
-    Raises:
-        ValueError: a vector that does not have one entry for each monomial, or moments of more than the stated memory.
     """
     return channel.moments(order).expect(_checked(channel, order, moments))
 

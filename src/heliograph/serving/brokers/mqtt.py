@@ -41,7 +41,7 @@ class Mqtt:
 
     async def publish(self, outputs: Sequence[Output]) -> None:
         for begin in range(0, len(outputs), MOST):
-            await asyncio.to_thread(self._writer.tell, outputs[begin : begin + MOST])
+            await asyncio.to_thread(self._writer.publish, outputs[begin : begin + MOST])
 
     async def close(self) -> None:
         await asyncio.gather(asyncio.to_thread(self._reader.close), asyncio.to_thread(self._writer.close))
@@ -168,7 +168,7 @@ class _Writer(_Connection):
         self.client.on_publish = self._has
         self.start()
 
-    def tell(self, outputs: Sequence[Output]) -> None:
+    def publish(self, outputs: Sequence[Output]) -> None:
         """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
         sent = set()
         for output in outputs:

@@ -128,9 +128,9 @@ class Carrier:
     def _translated(self, body: bytes) -> bytes:
         """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
         old, pool = self._old, self.fleet.pool
-        names, here = list(old["nodes"]), list(self.fleet.network.names)
+        names, names_here = list(old["nodes"]), list(self.fleet.network.names)
         same = [name for name in names if old["nodes"][name] == dict(self._sizes()).get(name)]
-        place = {i: here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
+        place = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
         # Parts of the bytes, as `plant_bytes` writes them.
         length, count, events, numbers = HEAD.unpack_from(body)
         head, at = json.loads(body[HEAD.size : HEAD.size + length]), HEAD.size + length
@@ -157,8 +157,8 @@ class Carrier:
         parts = np.split(values, ends[:-1]) if events else []
         triples = whole[2 * count :].reshape(events, 3)
         stay = [i for i, (row, p, _) in enumerate(triples) if int(p) in place and int(row) in number]
-        known = [(number[int(triples[i, 0])], place[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
-        integers = [x for row in rows for x in row[1:3]] + [x for item in known for x in item]
+        events_left = [(number[int(triples[i, 0])], place[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
+        integers = [x for row in rows for x in row[1:3]] + [x for item in events_left for x in item]
         data = np.concatenate([np.zeros(0), *(parts[i] for i in stay)])
         head["links"] = {name: link for name, link in head["links"].items() if name in (*same, "inputs")}
         text = json.dumps(head).encode()

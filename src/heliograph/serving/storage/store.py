@@ -25,7 +25,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.identity import Identity, check_same
+from heliograph.live.identity import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.carrying import DESCRIPTION, Carrier
@@ -106,25 +106,25 @@ class Store:
         opened: "Store | None" = None,
         carrier: Carrier | None = None,
     ):
-        self.process, self.journal = process, journal
+        self.process, self.journal, self.identity = process, journal, {}
         self._engine = engine_at(place)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
-        anything = mine is None
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:
             with self._saying("a database that can be written"):
                 self.identity = self._stored_identity(mine)
-                # Of a network that may differ the tables alone have to be the same.
-                mine, other = (_compared(item) for item in (mine or self.identity, self.identity))
-                if carrier is not None or anything:
-                    mine, other = {LAYOUT_KEY: LAYOUT}, {LAYOUT_KEY: other.get(LAYOUT_KEY, "")}
-                check_same(f"store {self.name}", mine, other)
+                self._check_layout()
+                # The network must be the same, unless its plants are carried over or any will do.
+                if carrier is None and mine is not None:
+                    check_same(f"store {self.name}", _compared(mine), _compared(self.identity))
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
                 if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
                     self.carry(carrier, f"store {self.name}", self.identity)
         except InputError as error:
             self.close()
-            raise InputError(f"{error}; to begin anew, name another; --accept-changes goes on with what fits") from None
+            fits = carrier is None and self.identity.get(LAYOUT_KEY) == LAYOUT
+            more = "; --accept-changes goes on with what fits" if fits else ""
+            raise InputError(f"{error}; to begin anew, name another{more}") from None
 
     @contextmanager
     def _saying(self, expected: str) -> Iterator[None]:
@@ -161,6 +161,13 @@ class Store:
         except (ValueError, TypeError):
             raise self._broken("no network that it is of") from None
         return {LAYOUT_KEY: "1"} | result
+
+    def _check_layout(self) -> None:
+        """Refuse a store of an older release, which does not say where the state of each filter stands in its rows."""
+        layout, release = self.identity.get(LAYOUT_KEY), self.identity.get("heliograph", "an unknown release")
+        if layout != LAYOUT:
+            raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {versions()['heliograph']}",
+                       f"layout {layout}, of heliograph {release}, whose plants cannot be carried over")  # fmt: skip
 
     def _damaged(self) -> dict[str, Damage]:
         """Return the plants with damaged rows, by name."""

@@ -26,13 +26,12 @@ from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
-from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 
@@ -188,9 +187,8 @@ def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel])
 
 def described(channel: Channel) -> SecondOrder | OverTime:
     """Second moments of the channel where all of it arrives, for each step where it varies."""
-    if isinstance(channel, OverTime):
-        return over_time([second_order(arrived(item)) for item in unstack(channel)])
-    return second_order(arrived(channel))
+    result: SecondOrder | OverTime = at_each_step(lambda item: second_order(arrived(item)), channel)
+    return result
 
 
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
@@ -263,10 +261,6 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 def _uncertain(channel: Channel) -> bool:
     """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(arrived(item).corner_count() > 1 for item in _steps_of(channel))
+        return any(arrived(item).corner_count() > 1 for item in unstack(channel))
     except ValueError:  # too many corners to list
         return True
-
-
-def _steps_of(channel: Channel) -> list[AbstractRandomAffine]:
-    return unstack(channel) if isinstance(channel, OverTime) else [channel]

@@ -149,7 +149,7 @@ def _group(
 def check_edge(link: Channel) -> None:
     """Refuse a link that delays, changes or quantizes a message, and losses that the receiver does not know of."""
     instance("link between neighbours", first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
-    for item in unstack(link) if isinstance(link, OverTime) else [link]:
+    for item in unstack(link):
         for part in item.maps if isinstance(item, Modes) else [item]:
             while isinstance(part, Erasure):
                 part = part.base

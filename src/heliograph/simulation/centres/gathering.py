@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.quantizer import widen
@@ -15,7 +14,7 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.centre import (
     AbstractObservation,
     Apart,

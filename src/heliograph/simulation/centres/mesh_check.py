@@ -117,13 +117,13 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     """
     nodes = network.mesh_nodes(name)
     sensors = [network.nodes[node] for node in nodes]
-    parts = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
-    varying = [item for pair in parts for item in pair] + [network.plant]
+    observations = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
+    varying = [item for pair in observations for item in pair] + [network.plant]
     if any(isinstance(item, OverTime) for item in varying):
         return
     a = np.asarray(first(network.plant).matrix)
     n = len(a)
-    refuse_angles(what, network.plant, *(sensor for sensor, _ in parts))
+    refuse_angles(what, network.plant, *(sensor for sensor, _ in observations))
     # Squares H'H of each node's mean gain, and their sums over those upstream.
     squares = np.zeros((len(nodes), n, n))
     for i, item in enumerate(sensors):
@@ -134,11 +134,11 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
             _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
     unseen: dict[bool, list[str]] = {True: [], False: []}
     values = np.linalg.eigvals(a)
-    known: dict[int, set[bool]] = {}
+    checked: dict[int, set[bool]] = {}
     for i, places in enumerate(upstream(graph_of(fusion.neighbours or {}, nodes))):
-        if id(places) not in known:
-            known[id(places)] = _unseen(a, values, squares[places].sum(axis=0))
-        for unstable in known[id(places)]:
+        if id(places) not in checked:
+            checked[id(places)] = _unseen(a, values, squares[places].sum(axis=0))
+        for unstable in checked[id(places)]:
             unseen[unstable].append(nodes[i])
     if unseen[True]:
         some = ", ".join(map(repr, unseen[True][:5])) + (" and more" if len(unseen[True]) > 5 else "")

@@ -113,15 +113,15 @@ def relay_tree(
         # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
-        parts = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
-        covariances, weights, level = (list(leaves) for leaves in zip(*parts, strict=True))
-        known, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
+        block_results = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
+        covariances, weights, level = (list(leaves) for leaves in zip(*block_results, strict=True))
+        level_covariances, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
         # Level by level up to the root.
         while True:
-            known.append(np.asarray(_spread(shared)))
-            if len(known[-1]) == 1:
-                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(known), tuple(used))
-            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(known[-1]), degree)]
+            level_covariances.append(np.asarray(_spread(shared)))
+            if len(level_covariances[-1]) == 1:
+                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
+            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
             outputs = [to_numpy(_relay(group)) for group in groups]
             used.append(np.stack([_padded(item, degree) for item, _ in outputs]))
             shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in outputs))

@@ -5,9 +5,8 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.traced import is_traced
-from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant

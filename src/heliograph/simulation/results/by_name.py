@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.fusion.rules import Fusion
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED, Network
 

@@ -141,38 +141,38 @@ def consistency(
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
     # Arguments: values (runs, steps) and degrees of freedom of each.
-    given = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
-    rows = np.atleast_2d(given)
+    entries = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
+    rows = np.atleast_2d(entries)
     level = float(scalar("confidence", confidence, 0.0, 1.0))
     if not 0 < level < 1:
         raise fail("confidence", "a number between 0 and 1", confidence)
-    there = ~np.isnan(rows)
+    present = ~np.isnan(rows)
     try:
         degrees = np.broadcast_to(np.asarray(dimension, dtype=np.float64), rows.shape)
     except (TypeError, ValueError):
         raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60]) from None
-    if not there.any():
-        raise fail("values", "at least one that is not NaN", f"shape {given.shape}")
-    if not (np.isfinite(degrees[there]).all() and (degrees[there] > 0).all()):
+    if not present.any():
+        raise fail("values", "at least one that is not NaN", f"shape {entries.shape}")
+    if not (np.isfinite(degrees[present]).all() and (degrees[present] > 0).all()):
         raise fail("dimension", DIMENSION_WORDS, repr(dimension)[:60])
     # Means and intervals: of all values, and of each step over the runs.
-    freedom = np.where(there, degrees, 0.0)
-    total = np.where(there, rows, 0.0)
-    count = there.sum(axis=0)
+    freedom = np.where(present, degrees, 0.0)
+    total = np.where(present, rows, 0.0)
+    count = present.sum(axis=0)
     by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
     quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
-    ends = _interval(freedom.sum(), there.sum(), quantiles)
+    ends = _interval(freedom.sum(), present.sum(), quantiles)
     every = np.stack([_interval(f, c, quantiles) for f, c in zip(freedom.sum(axis=0), count, strict=True)])
-    apart = np.where(there, rows - total.sum() / there.sum(), 0.0)
+    apart = np.where(present, rows - total.sum() / present.sum(), 0.0)
     correlation = _autocorrelation(apart, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
-        mean=float(total.sum() / there.sum()),
-        expected=float(freedom.sum() / there.sum()),
+        mean=float(total.sum() / present.sum()),
+        expected=float(freedom.sum() / present.sum()),
         interval=(float(ends[0]), float(ends[1])),
         means=by_step,
         intervals=every,
         autocorrelation=correlation,
-        autocorrelation_bound=float(ndtri(quantiles[1]) / np.sqrt(there.sum())),
+        autocorrelation_bound=float(ndtri(quantiles[1]) / np.sqrt(present.sum())),
     )
 
 

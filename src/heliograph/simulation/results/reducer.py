@@ -7,11 +7,11 @@ from typing import Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
     by_name,

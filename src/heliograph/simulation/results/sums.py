@@ -9,14 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.by_name import by_name, uplinks_by_name

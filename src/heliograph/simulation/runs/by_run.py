@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr
-from jaxtyping import PyTree
+
+from heliograph.numerics.types import PyTree
 
 
 def trajectories(

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PyTree
 
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import PyTree
 
 BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
 LANES = 8  # of a processor: at most this many cores are used

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from heliograph.codegen.engine import chosen
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
@@ -68,7 +69,7 @@ def fit_each(
 ) -> FitEach:
     """Fit each of many recordings of one length by itself, from the network's start, in one compiled program.
 
-    For studies: as `fit`, without its other starts and sentences, for free numbers that are single.
+    As `fit`, without its other starts and sentences, for free numbers that are single.
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
@@ -85,18 +86,20 @@ def fit_each(
         raise fail("free numbers", "single ones", [item.name for item in parameters.every if item.start.ndim])
     # the form, and the data
     known: Sequence[Objective] = objectives(description)
-    chosen = [item for item in known if form in (None, item.form)]
-    if not chosen:
+    fitting = [item for item in known if form in (None, item.form)]
+    if not fitting:
         raise fail("form", f"one of {', '.join(item.form for item in known)}", shown(form))
     z = array("measurements", measurements, (None, None, None), missing=True)
     count = len(description.start.inputs)
     u = np.zeros((z.shape[1], 0)) if inputs is None else array("inputs", inputs, (z.shape[1], count))
-    objective = chosen[-1]
+    objective = fitting[-1]
 
     def outcome(x: np.ndarray) -> Evaluation:
         with jax.enable_x64(True):
-            result: Evaluation = to_numpy(_evaluate_each(objective, x, z, u))
-        return result
+            choice = chosen(one_recording, (objective, x, z, u), [False, True, True, False])
+            if choice.code is None:
+                return to_numpy(_by_xla(objective, x, z, u))  # type: ignore[no-any-return]
+            return choice.results()  # type: ignore[no-any-return]
 
     def evaluate(x: np.ndarray) -> Evaluated:
         at = outcome(x)
@@ -122,6 +125,6 @@ def fit_each(
 
 
 @quickly_compiled
-def _evaluate_each(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+def _by_xla(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
     evaluation: Evaluation = jax.vmap(lambda point, item: one_recording(objective, point, item, u))(x, z)
     return evaluation

@@ -1,20 +1,115 @@
-"""Nodes whose clocks are wrong: offset and drift as states, and sensors whose values are stamped by such a clock."""
+"""Plants with further states: a dynamical bias, past outputs of the sensor, offset and drift of clocks."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
-from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import at_each_step, first
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Square, Vector
+from heliograph.random_affine.delay import of_line
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped, Square, Vector
+
+
+def with_bias(plant: LinearPlant, coupling: "Float[ArrayLike, 'n bias']", bias: LinearPlant) -> LinearPlant:
+    """Return the plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
+
+    Every filter of the result estimates both. A name that the plant has too gets the prefix "bias_".
+
+    Args:
+        plant: the plant of x (n states).
+        coupling: E (n, bias states).
+        bias: the plant of b, without inputs, independent of the first.
+
+    Raises:
+        ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
+    Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
+    """
+    for what, item in (("plant with bias", plant), ("bias", bias)):
+        instance(what, item, LinearPlant, "a LinearPlant")
+    n, extra = len(plant.states), len(bias.states)
+    coupling = array("coupling of the bias", coupling, (n, extra))
+    if bias.inputs:
+        raise fail("bias", "a plant without inputs", list(bias.inputs))
+    # (w, xi) and the two initial states are independent.
+    noises = [p.noise for p in (plant, bias) if isinstance(p.noise, AbstractNoise)]
+    if len(noises) < 2:
+        raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
+    deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
+    centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
+    xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
+    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; 0] u + [w; xi].
+    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
+    return LinearPlant(
+        xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
+        Independent(noises),
+        xp.concatenate(centers),
+        Independent(deviations),
+        xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
+        states=(*plant.states, *renamed.values()),
+        inputs=plant.inputs,
+        circular=(*plant.circular, *(renamed[name] for name in bias.circular)),
+    )
+
+
+def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
+    """Return plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent without delay.
+
+    y+ = C (A x + B u + w) + v is a state with its noise, so that one y received twice is known to be one. Past states x
+    instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
+    The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that
+            depends on inputs.
+    """
+    check_linear("plant and sensor behind a random delay", plant, sensor)
+    check_link(first(sensor), first(channel), len(first(plant).states), late=True)
+    moved: AnyPlant = at_each_step(partial(_with_line, past=first(channel).past), plant, sensor)
+    n, total = len(first(plant).states), len(first(moved).states)
+    everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
+    return moved, everything, of_line(channel)
+
+
+def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
+    """Return x+ = A x + B u + w, y+ = C x+ + v as one plant whose line of past outputs is shifted by one."""
+    if not isinstance(plant.noise, AbstractNoise):
+        raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")
+    c = sensor.matrix
+    xp = library(plant.matrix, plant.input_matrix, c)
+    m, n = c.shape
+    length = past * m
+    # (w, v) enters x+ and y+ = C w + v.
+    enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
+    # y_k, ..., y_{k-D+1} move on by one place.
+    shift = np.eye(length, length + m)
+    moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
+    rest = np.concatenate([np.zeros((n + m, length + m)), shift])
+    driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
+    # Nothing was sent before the start.
+    law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
+    names = sensor.outputs
+    line = [f"{name}_{d}_ago" if d else f"{name}_sent" for d in range(past + 1) for name in names]
+    return LinearPlant(
+        xp.concatenate([moves, rest], axis=1),
+        Shaped(enters, Independent([plant.noise, sensor.noise])),
+        xp.concatenate([plant.initial_mean - law.mean, np.zeros(length + m)]),
+        Independent([law, Gaussian(np.zeros((length + m, length + m)))]),
+        driven,
+        (*plant.states, *line),
+        plant.inputs,
+    )
+
 
 Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
 

@@ -1,0 +1,71 @@
+"""Likelihoods, scores and information of native code and of XLA are one; they are those of the filter's likelihood."""
+
+import jax
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.learning.description import describe
+from heliograph.learning.likelihood.objective import Data, _by_xla, at_points, objectives
+
+STEPS, RECORDINGS = 157, 2
+TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it
+DIFFERENCE = 1e-5  # of a number on the line: errors of central differences are its square
+
+
+def relayed():
+    """Two states behind a relay with a random gain and a direct link, both noises with means."""
+    noise = hg.Gaussian(np.eye(2) * hg.free(0.2, "plant noise", "positive"), [0.3, -0.1])
+    plant = hg.LinearPlant([[0.6, 0.2], [-0.1, 0.5]], noise, [1.0, -2.0], np.diag([1.0, 3.0]))
+    sensor = hg.LinearSensor([[1.0, 0.0], [0.5, 1.0]], hg.Gaussian(np.diag([0.3, 0.2]), [0.2, 0.0]))
+    channel = hg.parallel([hg.hop(hg.Rayleigh(hg.free(0.7, "scale")), hg.free(0.3, "hop noise")), hg.perfect()])
+    return hg.Network(plant, {"node": hg.Node(sensor, channel, {})})
+
+
+def walk():
+    """A random walk, whose own moments grow without end."""
+    plant = hg.LinearPlant([[1.0]], hg.free(0.2, "q"), [0.5], [[2.0]])
+    return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[2.0]], hg.free(0.3, "r")), hg.perfect(), {})})
+
+
+@pytest.fixture(scope="module", params=[relayed, walk])
+def both(request):
+    """An objective and data of which one number is lost."""
+    objective = objectives(describe(request.param))[0]
+    received = objective.description.start.nodes["node"].received
+    z = np.cumsum(np.random.default_rng(0).normal(size=(RECORDINGS, STEPS, received)), axis=1)
+    z[0, 3, 0] = np.nan
+    return objective, Data(z, np.zeros((RECORDINGS, STEPS, 0)), (STEPS,) * RECORDINGS)
+
+
+def points(objective):
+    start = objective.description.parameters.start
+    return start + np.random.default_rng(1).uniform(-1.5, 1.5, (3, len(start)))
+
+
+def test_native_code_computes_what_the_compiler_of_jax_does(both):
+    objective, data = both
+    x = points(objective)
+    native = at_points(objective, x, data)
+    with jax.enable_x64(True):
+        for i, point in enumerate(x):
+            parts = [_by_xla(objective, point, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
+            expected = (
+                np.stack([p.density for p in parts]),
+                np.stack([p.score for p in parts]),
+                sum(p.halves for p in parts),
+            )
+            for a, b in zip((leaf[i] for leaf in native), expected, strict=True):
+                np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
+
+
+def test_scores_are_the_derivatives_of_the_likelihood(both):
+    objective, data = both
+    for x in points(objective):
+        result = at_points(objective, x[None], data)
+        with jax.enable_x64(True):
+            total = sum(hg.log_likelihood(objective.filter(x), z) for z in data.measurements)
+        np.testing.assert_allclose(result.total[0], total, rtol=1e-12)
+        ends = [at_points(objective, x + sign * DIFFERENCE * np.eye(len(x)), data).total for sign in (-1, 1)]
+        slopes = (ends[1] - ends[0]) / (2 * DIFFERENCE)
+        np.testing.assert_allclose(result.gradient[0], slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
