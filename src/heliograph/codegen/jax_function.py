@@ -72,7 +72,7 @@ class _Evaluation:
     def block(self, items: list[Any]) -> None:
         """Evaluate operations and statements in order."""
         for item in items:
-            if isinstance(item, Check) or item not in self.needed:
+            if item not in self.needed:  # a check of a loop among them
                 continue
             if isinstance(item, Store):
                 place = self._place(item.buffer, item.offset, item.strides, item.indices)
@@ -114,6 +114,7 @@ class _Evaluation:
         carried = [k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed]
         filled, outer, memory = self._within(loop.body), self.values, self.memory
 
+        # In a turn the parameters and the memory are those of the carry.
         def within(carry: PyTree, counter: Any) -> None:
             self.values, self.memory = dict(outer), memory | dict(zip(filled, carry[1], strict=True))
             self.values |= zip((loop.parameters[k] for k in carried), carry[0], strict=True)
@@ -131,6 +132,7 @@ class _Evaluation:
             assert loop.condition is not None
             return self.value(loop.condition)
 
+        # From the first carry to the last, whose values are the loop's results.
         start = [self.value(loop.initial[k]) for k in carried], [memory[b] for b in filled]
         if loop.length is None:
             end = lax.while_loop(goes_on, lambda carry: turn(0, carry), start)
