@@ -18,7 +18,7 @@ from heliograph.simulation.judging import any_implausible, doubts, forbidden_row
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part, with_truth
+from heliograph.simulation.smoothed import Smoother, found_record, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -167,7 +167,7 @@ def _run_filters(
     rows = jnp.arange(len(u)), u, z, arrivals
     results = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else one_run(later.both, results)) | judged
+    return (results if later is None else later.both(results)) | judged
 
 
 _by_xla = quickly_compiled(_run_filters)
