@@ -9,9 +9,9 @@ import numpy as np
 
 from heliograph.filters.plausibility import why_inputs, why_values
 from heliograph.live.event import INPUTS
-from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
 from heliograph.live.row_step import RowStep
+from heliograph.live.snapshot import Identity, network_identity
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant
 from heliograph.numerics.check import fail

@@ -10,8 +10,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.plausibility import INPUT, in_words, why_inputs
-from heliograph.live.identity import Identity, check_same, short_name, versions
-from heliograph.live.snapshot import packed, unpacked
+from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim

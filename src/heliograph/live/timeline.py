@@ -8,22 +8,39 @@ from typing import Any
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, VERDICTS, Known, Verdict, moment, numbers, whole
-from heliograph.live.finals import Finals
-from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import SenderStatus, sender_status
-from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
+from heliograph.live.snapshot import check_same, packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
+
+
+class Finals:
+    """Rows of final outputs, of `size` numbers, in order of time; beyond `most` rows the oldest parts are dropped."""
+
+    def __init__(self, most: int, size: int):
+        self.most, self.size, self._parts = most, size, list[tuple[np.ndarray, np.ndarray]]()
+
+    def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
+        """Append the outputs of some rows."""
+        self._parts.append((time, rows))
+        while sum(len(part) for part, _ in self._parts[1:]) >= self.most:
+            del self._parts[0]
+
+    def take(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
+        """Remove and return all times and rows."""
+        times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
+        self._parts = []
+        return np.concatenate(times), np.concatenate(rows)
 
 
 @readable
