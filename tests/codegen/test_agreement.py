@@ -10,6 +10,7 @@ from heliograph.codegen import engine
 from heliograph.codegen.compiled import Alone, Compiled, compile
 from heliograph.codegen.engine import engine_of
 from heliograph.codegen.program import lower
+from heliograph.numerics.over_runs import runs_last
 
 RANDOM = np.random.default_rng(4)
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
@@ -217,6 +218,15 @@ def test_a_user_can_ask_for_the_engine_and_force_one(monkeypatch):
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "gpu")
     with pytest.raises(ValueError, match="HELIOGRAPH_ENGINE: expected native or xla, got gpu"):
         engine_of(svd, x)
+
+
+@pytest.mark.parametrize("length", [5, 300])
+def test_a_kernel_over_many_takes_what_they_share_from_memory_whole(length):
+    """Forty runs within each run: their own number, and a row that all of them share, of which none takes a part."""
+    kernel = runs_last(lambda a, b: a * jnp.sum(b, axis=0) if b.ndim > a.ndim else a * b)
+    x, row = RANDOM.normal(size=(2, 40)), RANDOM.normal(size=(2, length))
+    result = hg.simulation.over_runs(jax.vmap(kernel, in_axes=(0, None)), x, row)
+    np.testing.assert_allclose(result, x * row.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
 def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypatch):
