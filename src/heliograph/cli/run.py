@@ -164,14 +164,14 @@ def _filtered(
 
 
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
-    """Describe what was written where, a line for each file."""
+    """Describe what was written where in a line, and the errors of each filter."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places] + _errors(record)
+    places = " and ".join(str(path) for path in (out, report and report / "report.html") if path is not None)
+    return [f"{places}: {len(record.time)} rows of {', '.join(filters)}", *_errors(record)]
 
 
 def _errors(record: "Record") -> list[str]:
