@@ -11,7 +11,7 @@ from heliograph.live.event import INPUTS, OF_STEPS, VERDICTS, Known, Verdict, mo
 from heliograph.live.player import player
 from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.senders import SenderStatus, sender_status
+from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.snapshot import check_same, packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
@@ -180,16 +180,19 @@ class Timeline:
         Raises:
             ValueError: no such node.
         """
-        deciding = {n: v for n, v in self.network.nodes.items() if isinstance(v, Node) and v.trigger is not None}
+        nodes = {name: node for name, node in self.network.nodes.items() if isinstance(node, Node)}
+        deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
         if not deciding:
             raise fail("senders", "a node with a trigger", list(self.network.names))
         final, now = int(np.ceil(self.now - self.window)) - 1, int(np.floor(min(self.now, self._end())))
         results = {}
-        for name, node in deciding.items():
+        for name, (trigger, node) in deciding.items():
             place = self._sizes[name][0]
             times = [row.key[0] for row in self._rows.held if any(at == place for at, _, _ in row.events)]
             last = max([*times, self._last[place]], default=np.nan)
-            results[name] = sender_status(node, None if np.isnan(last) else int(last), final, now)
+            results[name] = sender_status(
+                trigger, LossChain.of_node(node), None if np.isnan(last) else int(last), final, now
+            )
         return results
 
     def _end(self) -> float:

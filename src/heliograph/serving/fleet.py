@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
 from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.senders import SenderStatus, sender_status
+from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
@@ -77,7 +77,9 @@ class Fleet:
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
         self._joint = self.lanes.dt is None or network.common is not None
         # Nodes whose sender decides when to send.
-        self.deciding = {n: v for n, v in network.nodes.items() if isinstance(v, Node) and v.trigger is not None}
+        nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+        deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
+        self.deciding = {name: (trigger, LossChain.of_node(node)) for name, (trigger, node) in deciding.items()}
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.start(self._blank, -1.0)
@@ -178,7 +180,7 @@ class Fleet:
         last = {
             name: int(link.latest) if link is not None and link.latest >= 0 else None for name, link in links.items()
         }
-        return {name: sender_status(node, last[name], final, now) for name, node in self.deciding.items()}
+        return {name: sender_status(*items, last[name], final, now) for name, items in self.deciding.items()}
 
     def forget(self, finalised: Iterable[Finalised]) -> None:
         """Free the slots of these rows, once their outputs have been read."""
