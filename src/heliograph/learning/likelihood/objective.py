@@ -194,11 +194,11 @@ def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data
     with jax.enable_x64(True):
         choice = chosen(one_recording, (objective, *runs), [False, True, True, True])
         if choice.code is not None:
-            each = choice.results()
+            results = choice.results()
         else:
             parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
-            each = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in each)
+            results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
     return Evaluation(density, score, halves.sum(axis=1))
 
 
