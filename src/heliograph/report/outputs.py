@@ -1,4 +1,4 @@
-"""Innovations of a run, output by output: how many values were down-weighted, their bias, and which to blame; errors of its filters."""
+"""Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -177,8 +177,8 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     async with _watched(settings) as look:
         lanes = Lanes(settings.network)
-        if lanes.uneven:
-            what = f"predictions depend on when others are asked for: {lanes.uneven}"
+        if lanes.player.uneven:
+            what = f"predictions depend on when others are asked for: {lanes.player.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
             await _alone(settings, lanes, look)

@@ -6,9 +6,9 @@ kappa = E g^2 / (E g)^2 and F that of p / (p + alpha), alpha = Var m / E g^2. So
     j = F / (s K - t F),   dj/dp_h = s K / (s K - t F)^2 dF/dp_h:
 nothing is divided by a power, which may be zero.
 
-The best linear filter in information form has P_k^-1 = X_k^-1 + J_k, X_k = A P_{k-1} A' + Q. For a cost sum_k <W_k, P_k>
-the adjoint L_k = W_k + Phi_{k+1}' L_{k+1} Phi_{k+1}, Phi_k = (I - P_k J_k) A_k, gives d cost = - sum_k <P_k L_k P_k, dJ_k>:
-one backward recursion, or one Lyapunov equation, for any number of parameters.
+The best linear filter in information form has P_k^-1 = X_k^-1 + J_k, X_k = A P_{k-1} A' + Q. For a cost
+sum_k <W_k, P_k> the adjoint L_k = W_k + Phi_{k+1}' L_{k+1} Phi_{k+1}, Phi_k = (I - P_k J_k) A_k, gives
+d cost = - sum_k <P_k L_k P_k, dJ_k>: one backward recursion, or one Lyapunov equation, for any number of parameters.
 """
 
 from functools import reduce

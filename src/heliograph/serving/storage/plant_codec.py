@@ -33,8 +33,8 @@ def description(fleet: Fleet) -> str:
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.lanes.given,
-        "state": fleet.lanes.state.size,
-        "outputs": fleet.lanes.outputs.size,
+        "state": fleet.pool.step_rows.state.size,
+        "outputs": fleet.pool.step_rows.outputs.size,
         "filters": _filter_columns(fleet),
     }
     return json.dumps({"values": {name: _values(part) for name, part in parts.items()}, "layout": layout})
@@ -52,7 +52,7 @@ def _values(part: PyTree) -> dict[str, object]:
 
 def _filter_columns(fleet: Fleet) -> dict[str, dict[str, list[Any]]]:
     """Return the columns of each filter's state by its name: of each leaf its shape, and its columns' begin and end."""
-    network, flat = fleet.network, fleet.lanes.state
+    network, flat = fleet.network, fleet.pool.step_rows.state
     numbered = flat.tree(np.arange(float(flat.size)))
     local, central, *rest = numbered
     results: dict[str, dict[str, list[Any]]] = {}
@@ -189,7 +189,7 @@ class Carrier:
         given, state = old["given"], old["state"]
         result = np.zeros(pool.table.shape[1])
         # The state: of filters that go on their own, of others the start.
-        result[pool.state] = lanes.start
+        result[pool.state] = pool.step_rows.start
         new = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
         for name in new:
             if self._goes_on(name, new):

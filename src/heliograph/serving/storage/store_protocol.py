@@ -84,7 +84,7 @@ def identity(fleet: Fleet) -> Identity:
         fleet: the fleet whose plants the store keeps.
     """
     instance("fleet", fleet, Fleet, "a Fleet")
-    return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict()) | {
+    return network_identity(fleet.network, fleet.lanes.player.step_rows.program(), fleet.options._asdict()) | {
         DESCRIPTION: description(fleet)
     }
 
