@@ -188,19 +188,18 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 
 
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
-    """Likelihood, scores and information at points of the line: native code, all points side by side, or XLA."""
+    """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
+    count, z, u = len(data.measurements), data.measurements, data.inputs
+    runs = np.repeat(x, count, axis=0), np.tile(z, (len(x), 1, 1)), np.tile(u, (len(x), 1, 1))
     with jax.enable_x64(True):
-        parts = [_at_points(objective, x, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
-    density, score, halves = zip(*parts, strict=True)
-    return Evaluation(np.stack(density, axis=1), np.stack(score, axis=1), np.sum(halves, axis=0))
-
-
-def _at_points(objective: Objective, x: np.ndarray, z: np.ndarray, u: np.ndarray) -> Evaluation:
-    """Evaluate one recording at points, (points, ...)."""
-    choice = chosen(one_recording, (objective, x, z, u), [False, True, False, False])
-    if choice.code is not None:
-        return choice.results()  # type: ignore[no-any-return]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *(to_numpy(_by_xla(objective, point, z, u)) for point in x))  # type: ignore[no-any-return]
+        choice = chosen(one_recording, (objective, *runs), [False, True, True, True])
+        if choice.code is not None:
+            results = choice.results()
+        else:
+            parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
+            results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
+    return Evaluation(density, score, halves.sum(axis=1))
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
