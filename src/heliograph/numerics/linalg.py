@@ -166,7 +166,7 @@ def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
 
     The root is taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
     """
-    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole
+    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot, 1000) * whole
     beyond = jnp.where(singular, jnp.inf, jnp.nan)
     return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
 
