@@ -80,10 +80,11 @@ class Lanes:
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
-            with jax.enable_x64(True):
-                return to_numpy(reduce(added, [carry for carry in self.carries if carry is not None]))
-        lanes = [jax.tree.map(lambda leaf: np.asarray(leaf)[lane], self.carries) for lane in range(self.count)]  # noqa: B023
-        return to_numpy(reduce(added, lanes))
+            lanes = [carry for carry in self.carries if carry is not None]
+        else:
+            lanes = [jax.tree.map(lambda leaf: np.asarray(leaf)[lane], self.carries) for lane in range(self.count)]  # noqa: B023
+        with jax.enable_x64(True):
+            return to_numpy(reduce(added, lanes))
 
 
 class Shared(NamedTuple):
