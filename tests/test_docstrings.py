@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import heliograph
+import heliograph_studies
 
 SOURCE = Path(heliograph.__file__).parent
 FIRST = {
@@ -27,6 +28,8 @@ LONG = 15  # lines of a function that needs a comment above its steps
 SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 PATHS = sorted(SOURCE.rglob("*.py"))
+ROOTS = (Path(heliograph_studies.__file__).parent, Path(__file__).parent)
+OTHERS = sorted(path for root in ROOTS for path in root.rglob("*.py"))
 
 
 def definitions(path: Path) -> Iterator[Function | ast.ClassDef]:
@@ -80,6 +83,17 @@ def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
         if (first and first[1].lower() in FIRST) or PRIVATE.search(text):
             wrong.append(f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_docstrings_of_studies_and_tests_have_no_private_word():
+    """But "beside" for a place: "figures, and what the page says beside the numbers"."""
+    wrong = {
+        f"{path}: {getattr(node, 'name', 'module')}: {used[0]}"
+        for path in OTHERS
+        for node in [ast.parse(path.read_text()), *definitions(path)]
+        if (used := [word for word in PRIVATE.findall(ast.get_docstring(node) or "") if word.lower() != "beside"])
+    }
+    assert not wrong, "\n".join(sorted(wrong))
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))

@@ -169,3 +169,50 @@ def test_inputs_hold_and_repeated_events_count_once(world):
     np.testing.assert_array_equal(rows.time, [0.0, 1.0, 3.0])
     np.testing.assert_array_equal(rows.inputs, [[0.0, 0.0], [0.0, 1.0], [2.0, 2.0]])
     np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [5.0, np.nan, 7.0])
+
+
+def test_a_law_of_delays_is_learned_from_the_times_of_logging(world, tmp_path):
+    """Delays of 0, 1 and 3 steps, in 60, 30 and 10 of 100: within three deviations of a share of 1,000 messages."""
+    network, sources, *_ = world
+    chance, share = np.random.default_rng(0), np.array([0.6, 0.3, 0.1])
+    delays, jitter = chance.choice([0, 1, 3], 1000, p=share), chance.uniform(-0.4, 0.4, 1000)
+    messages = []
+    for k, (d, part) in enumerate(zip(delays, jitter, strict=True)):
+        at = bags.START + k * 10**8
+        messages.append(
+            (at + round(max(d + part, 0.0) * 10**8), "/odometry", bags.ODOMETRY, bags.odometry(at, 0.1 * k))
+        )
+    path = bags.write(tmp_path / "late", sorted(messages, key=lambda item: item[0]))
+    table = hg.files.read_messages(path, network, sources)
+    law = table.delay_law("gps", 0.1)
+    np.testing.assert_array_equal(law.values, [0.0, 1.0, 3.0])
+    assert np.all(np.abs(law.probabilities - share) < 3 * np.sqrt(share * (1 - share) / 1000))
+    assert hg.model.delayed(hg.perfect(), law).times == (0, 1, 3)
+    with pytest.raises(ValueError, match="node of a delay law: expected one of gps, which have events, got inputs"):
+        table.delay_law("inputs", 0.1)
+
+
+def test_dates_become_steps_of_a_network_that_counts_them(tmp_path):
+    """Steps of half a second from the first date on: each date is of the nearest; an event is as late as it was."""
+    plant, sensor = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {}, trigger=hg.SendOnDelta(0.5))})
+    rows = [("10:00:00.100", 1.0, "10:00:00.2"), ("10:00:01.050", 2.0, "10:00:03"), ("10:00:02.320", 3.0, "10:00:02.4")]
+    text = "".join(f"2026-11-25T{at}Z,{value},2026-11-25T{came}Z\n" for at, value, came in rows)
+    (tmp_path / "log.csv").write_text(f"at,value,arrival\n{text}")
+    sources = {"log.csv": hg.files.json_field("value", "a", time="at", step=0.5)}
+    table = hg.files.read_messages(tmp_path / "log.csv", network, sources)
+    assert [(e.time, e.values[0], e.arrival) for e in table.in_order()] == [(0, 1.0, 0), (4, 3.0, 5), (2, 2.0, 6)]
+    rows = table.recording()
+    np.testing.assert_array_equal(rows.measurements["a"][:, 0], [1.0, np.nan, 2.0, np.nan, 3.0])
+    np.testing.assert_allclose(table.lateness()["a"], [0.1, 1.95, 0.08], rtol=1e-9)
+    assert table.date == np.datetime64("2026-11-25T10:00:00.1")
+    line = hg.Timeline(network, window=10)
+    assert [line.push(*event) for event in table.in_order()] == ["used"] * 3
+    for changed, words in (
+        (dict(step=None), r"log.csv', time: expected the seconds of a step \(step=0.1\), or a time field in steps"),
+        (dict(step=0.0), "json_field, step: expected"),
+        (dict(step=0.5, time_unit="step"), "json_field, step: expected none where the time is in steps already"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            field = hg.files.json_field("value", "a", time="at", **changed)
+            hg.files.read_messages(tmp_path / "log.csv", network, {"log.csv": field})

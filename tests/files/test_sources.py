@@ -111,7 +111,7 @@ def test_a_topic_feeds_several_nodes():
 
 def test_steps_are_times_of_networks_that_count_steps():
     assert read(json_field("v", "garden", time="k", time_unit="step"), {"v": 1, "k": 3}, COUNTING).time == 3
-    with pytest.raises(ValueError, match=r"'t', time: expected a time field in steps .* got 'k' in s"):
+    with pytest.raises(ValueError, match=r"'t', time: expected the seconds of a step .* got 'k' in s"):
         Sources({"t": json_field("v", "garden", time="k")}, COUNTING)
     with pytest.raises(ValueError, match="expected a time that is no step"):
         Sources({"t": json_field("v", "garden", "in", time="k", time_unit="step")}, NETWORK)

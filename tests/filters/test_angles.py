@@ -116,7 +116,7 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
 
 @pytest.mark.slow
 def test_what_is_smoothed_is_turned_too(east_and_west):
-    """Sweeps never wrap, so that the cut is nowhere; what they tell is between -pi and pi. To rounding of 30 steps."""
+    """Sweeps never wrap: the cut is at no angle; what they tell is between -pi and pi. To rounding of 30 steps."""
     results = [record.smoothed for record in east_and_west]
     for node, estimate in results[0].estimates.items():
         for name, item in estimate.items():

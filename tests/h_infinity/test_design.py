@@ -78,7 +78,7 @@ def test_the_recursion_cannot_look_ahead():
 
 
 def test_steps_that_are_the_same_are_compiled_once(monkeypatch):
-    """The best predictor's gain, near which a step is searched, settles within a few steps; it made each its own."""
+    """A predictor's gain, near which a step is searched, is stationary within a few steps; it made each its own."""
     made = []
 
     class Counted(design.StepProblem):

@@ -202,7 +202,11 @@ def test_a_browser_draws_axes_with_units_what_is_not_final_and_the_state_of_send
         assert path.count("L") == 300 - 4 - 1  # the line ends with the last final estimate
         names = re.findall(r'<th scope="row">(node \d+)</th>', text)
         assert names == [f"node {i}" for i in range(14)] and '<p id="search" class="choices">' in text
-        assert ">silent for 5 steps</td>" in text and ">dead: 9 heartbeats missed</td>" in text
+        assert (
+            ">14 nodes</span>" in text
+            and ">silent for 5 steps</td>" in text
+            and ">dead: 9 heartbeats missed</td>" in text
+        )
 
     looked(look, Scripted(nodes=14, waiting=4, senders=SENDERS), watch=watch)
 

@@ -146,8 +146,21 @@ BOX, STEPS = ([0.4, 0.5], "box"), ([0.4, 0.5], "each")
         (ALONE, hg.SendOnDelta(STEPS[0], region="each", heartbeat=15)),
         (ALONE, hg.SendOnDelta(STEPS[0], region="each", losses="numbered")),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnPredictionError(BOX[0])),
+        (hg.perfect(2), hg.SendOnDelta(0.5, region="ball")),
+        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", heartbeat=30)),
+        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", reference="acknowledged")),
     ],
-    ids=["box", "box, lossy", "each", "each, lossy, heartbeat", "each, numbered", "prediction, lossy"],
+    ids=[
+        "box",
+        "box, lossy",
+        "each",
+        "each, lossy, heartbeat",
+        "each, numbered",
+        "prediction, lossy",
+        "ball",
+        "ball, lossy, heartbeat",
+        "ball, acknowledged",
+    ],
 )
 def test_several_components_are_filtered_and_claimed_rightly(channel, trigger):
     """Mean squared error in units of the claim: 1.00, .99, 1.01, 1.03, 1.04, 1.00 in 256 runs of 100 steps."""

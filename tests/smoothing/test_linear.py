@@ -94,7 +94,7 @@ def test_a_state_that_later_data_tell_exactly_is_smoothed_to_its_rounding(smooth
     """Both states are a multiple of one number, at first unseen, then seen without noise, and known from there on.
 
     The innovations that follow are rounding, and so is their variance: an adjoint that divides by it is 1e15 too large
-    when the update that told the states is to take it off again.
+    when the update that gave the states is to take it off again.
     """
     plant = hg.LinearPlant([[0.8, 0.32], [-1.26, 0.88]], 0.0, [0.5, -0.7], np.outer([0.3, 0.03], [0.3, 0.03]))
     sensor, channel = hg.LinearSensor([[-0.16, -0.48], [0.6, 0.04]], 0.0), hg.erasure(hg.perfect(2), 0.7)

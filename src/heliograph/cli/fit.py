@@ -23,7 +23,7 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or a bag.")],
     out: Annotated[Path, place("Folder for fitted.json, fitted_network.py, figures and a page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
@@ -62,7 +62,9 @@ def fit(
 def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
+    from heliograph.cli.run import read_mapped
     from heliograph.files.fitted import NetworkAgain
+    from heliograph.files.network_file import load_module
     from heliograph.files.recording import Recording, read_recording
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
@@ -77,7 +79,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
-    recording = read_recording(measurements, start)
+    messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
+    recording = read_recording(measurements, start) if messages is None else messages.recording()
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)

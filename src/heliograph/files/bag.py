@@ -4,10 +4,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from heliograph.files.bag_layout import Decoder, RawMessage
 from heliograph.files.cut_bag import is_cut, whole_part
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources
@@ -18,18 +19,10 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 BAGS = (".mcap", ".db3", ".bag")
-OFTEN = 5000  # messages between two reports of progress
+OFTEN = 5000  # messages that are decoded at once, and between two reports of progress
+LARGE = 1 << 22  # bytes that are decoded at once
 LISTED = 8  # topics in one line
 Progress = Callable[[int, int], None]
-
-
-class BagMessage(NamedTuple):
-    """Message of a bag: its topic and type, the time it was logged in nanoseconds, and its content."""
-
-    topic: str
-    type: str
-    logged: int
-    content: object
 
 
 def is_bag(path: Path) -> bool:
@@ -53,7 +46,8 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         ValueError: no bag, sources that do not fit the network, or none whose topic is in the bag; one line.
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
-    sources, result = Sources(table, network), EventTable(network)
+    sources = Sources(table, network)
+    result = EventTable(network, sources.step)
     with opened(path) as (reader, cut):
         result.broken = cut
         counts = Counter[str]()
@@ -65,18 +59,15 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         if not used:
             raise fail(f"{path}", f"a topic of the sources, {_listed(sources.topics)}", f"only {_listed(counts)}")
         _check_types(path, reader, sources)
-        # Each message becomes events; the first that cannot be read ends the reading.
-        total, done = sum(counts[topic] for topic in used), 0
+        # Messages become events, many at once where all of them can; the first that cannot be read ends the reading.
+        total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
-            for done, message in enumerate(messages(path, reader, used), 1):
-                if progress is not None and done % OFTEN == 0:
+            for batch in batches(raw_messages(path, reader, used)):
+                if not decoder.add(batch, result):
+                    _add(path, reader, sources, batch, done, result)
+                done += len(batch)
+                if progress is not None:
                     progress(done, total)
-                try:
-                    readings = sources.read(message.topic, message.content, message.topic)
-                except InputError as error:
-                    raise InputError(f"{path}, message {done}, logged at {moment(message.logged)}, {error}") from None
-                for reading in readings:
-                    result.add(reading, message.logged)
         except InputError as error:
             if not len(result):
                 raise
@@ -126,17 +117,16 @@ def _reader(path: Path, place: Path) -> "Iterator[AnyReader]":
         reader.close()
 
 
-def messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[BagMessage]:
+def raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[RawMessage]:
     """Yield the messages of topics in the order in which they were logged.
 
     Raises:
-        ValueError: damage, a type that the bag does not define, a topic that changes its type; one line with the place.
+        ValueError: damage, a topic that changes its type; one line with the place.
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
     types, raw = dict[str, str](), reader.messages(connections) if connections else iter(())
     count, last = 0, 0
     while True:
-        # The next message as bytes.
         try:
             connection, logged, data = next(raw)
         except StopIteration:
@@ -144,18 +134,53 @@ def messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[Bag
         except Exception as error:
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
             raise fail(f"{path}, {after}", "a bag without damage", _reason(error)) from None
-        # Its content, of the type that its topic had before.
+        # Of the type that its topic had before.
         kind = connection.msgtype
         if types.setdefault(connection.topic, kind) != kind:
             where = f"{path}, {connection.topic}, logged at {moment(logged)}"
             raise fail(where, f"messages of {types[connection.topic]}, as before", kind)
+        yield RawMessage(connection, logged, bytes(data))
+        count, last = count + 1, logged
+
+
+def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+    """Yield messages in lists of bounded size; an error comes after what was read before it."""
+    batch, size, failure = list[RawMessage](), 0, None
+    # Up to so many messages or bytes, or to the end.
+    while failure is None:
+        try:
+            message = next(messages, None)
+        except InputError as error:
+            message, failure = None, error
+        if message is not None:
+            batch.append(message)
+            size += len(message.data)
+        if batch and (message is None or len(batch) >= OFTEN or size >= LARGE):
+            yield batch
+            batch, size = [], 0
+        if message is None:
+            break
+    if failure is not None:
+        raise failure
+
+
+def _add(
+    path: Path, reader: "AnyReader", sources: Sources, batch: list[RawMessage], done: int, result: EventTable
+) -> None:
+    """Append the events of messages one after another, up to the first that cannot be read, which is an error."""
+    for number, (connection, logged, data) in enumerate(batch, done + 1):
+        topic, kind = connection.topic, connection.msgtype
         try:
             content = reader.deserialize(data, kind)
         except Exception as error:
-            where = f"{path}, {connection.topic}, logged at {moment(logged)}"
+            where = f"{path}, {topic}, logged at {moment(logged)}"
             raise fail(where, f"a message of {kind}", _reason(error)) from None
-        yield BagMessage(connection.topic, kind, logged, content)
-        count, last = count + 1, logged
+        try:
+            readings = sources.read(topic, content, topic)
+        except InputError as error:
+            raise InputError(f"{path}, message {number}, logged at {moment(logged)}, {error}") from None
+        for reading in readings:
+            result.add(reading, logged)
 
 
 def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:

@@ -9,9 +9,10 @@ import numpy as np
 from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import TINY, fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float, Int
+from heliograph.random_affine.law import Discrete
 from heliograph.simulation.network import Network
 
 SECOND = 10**9  # nanoseconds
@@ -41,7 +42,12 @@ class Columns:
 class EventTable:
     """Events of a network, read from messages of a recording, each with the time when it was measured and when logged.
 
-    Where the network counts steps, times are steps and events arrive at once.
+    Where the network counts steps, times are steps and events arrive at once; with the seconds of a `step` times are
+    moments, each of the step that is nearest, counted from the first.
+
+    Args:
+        network: the network.
+        step: seconds of a step of a network that counts steps; None where times are steps, or seconds.
 
     Attributes:
         columns: events by node, and of "inputs".
@@ -49,9 +55,10 @@ class EventTable:
         broken: where and why reading ended early; "" if it did not.
     """
 
-    def __init__(self, network: Network):
+    def __init__(self, network: Network, step: float | None = None):
         instance("network", network, Network, "a Network")
         self.network, self.steps = network, TIME_STEP not in network.inputs
+        self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
         given = len(network.inputs) - (not self.steps)
         self.columns = {INPUTS: Columns(given)}
         self.columns |= {name: Columns(network.nodes[name].received) for name in network.names}
@@ -70,9 +77,26 @@ class EventTable:
         time = arrival if reading.time is None else reading.time
         counted = len(columns.time) if reading.time is None else 0
         columns.time.append(time)
-        columns.arrival.append(time if self.steps else arrival)
+        columns.arrival.append(time if self._at_once else arrival)
         columns.sequence.append(counted if reading.sequence is None else reading.sequence)
         columns.values.extend(reading.values.tolist())
+
+    def add_many(
+        self,
+        node: str,
+        arrival: Int[np.ndarray, " events"],
+        time: Int[np.ndarray, " events"],
+        sequence: Int[np.ndarray, " events"],
+        values: Float[np.ndarray, "events size"],
+    ) -> None:
+        """Append readings of a node as `add` does one after another; a time or count of -1 is one that is not there."""
+        columns, counted = self.columns[node], len(self.columns[node].time) + np.arange(len(time))
+        sequence = np.where(sequence >= 0, sequence, np.where(time < 0, counted, 0))
+        time = np.where(time < 0, arrival, time)
+        for column, numbers in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
+            column.frombytes(numbers.tobytes())
+        columns.sequence.frombytes(sequence.tobytes())
+        columns.values.frombytes(values.tobytes())
 
     @property
     def origin(self) -> int:
@@ -81,21 +105,38 @@ class EventTable:
         Raises:
             ValueError: no events.
         """
+        first = self._first()
+        return 0 if self.steps else first
+
+    def _first(self) -> int:
         times = [min(columns.time) for columns in self.columns.values() if columns.time]
         if not times:
             raise fail("events", "at least one", "none")
-        return 0 if self.steps else min(times)
+        return min(times)
+
+    @property
+    def _at_once(self) -> bool:
+        """Return whether times are steps, which say nothing of the moment of arrival."""
+        return self.steps and self.step is None
+
+    def _arrays(self, name: str) -> tuple[Int[np.ndarray, " events"], ...]:
+        """Return times, arrivals and counts of a node, in steps or nanoseconds."""
+        time, arrival, sequence = self.columns[name].arrays()
+        if self.step is not None and len(time):
+            first, half = self._first(), self.step // 2
+            time, arrival = ((moments - first + half) // self.step for moments in (time, arrival))
+        return time, arrival, sequence
 
     @property
     def date(self) -> np.datetime64:
         """Return the date from which the times of the events count."""
-        return np.datetime64(self.origin, "ns")
+        return np.datetime64(0 if self._at_once else self._first(), "ns")
 
     def in_order(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin or in steps."""
         origin, unit = self.origin, 1 if self.steps else SECOND
         names = list(self.columns)
-        parts = [columns.arrays() for columns in self.columns.values()]
+        parts = [self._arrays(name) for name in names]
         values = [columns.matrix() for columns in self.columns.values()]
         node = np.repeat(np.arange(len(names)), [len(part[0]) for part in parts])
         row = np.concatenate([np.arange(len(part[0])) for part in parts])
@@ -112,11 +153,33 @@ class EventTable:
         The events are in order of their times.
         """
         results = {}
-        for name in () if self.steps else self.network.names:
+        for name in () if self._at_once else self.network.names:
             time, arrival, _ = self.columns[name].arrays()
             if len(time):
                 results[name] = ((arrival - time) / SECOND)[np.argsort(time, kind="stable")]
         return results
+
+    def delay_law(self, node: str, step: float) -> Discrete:
+        """Return the most likely law of a node's delays in steps, for `delayed(link, law)`.
+
+        The share of each delay among the events is its probability; steps that no event was late by have none.
+
+        Args:
+            node: name of a node.
+            step: seconds of a step.
+
+        Raises:
+            ValueError: a node without events, a step that is not positive, an event that was logged before its time.
+        """
+        late = self.lateness().get(node)
+        if late is None:
+            raise fail("node of a delay law", f"one of {', '.join(self.lateness()) or 'none'}, which have events", node)
+        delays = np.floor(late / float(scalar("step", step, TINY)) + 0.5).astype(np.int64)
+        if delays.min() < 0:
+            raise fail(f"delays of {node!r}", "no event that was logged before its time", f"{late.min():.3g} s")
+        counts = np.bincount(delays)
+        there = np.flatnonzero(counts)
+        return Discrete(there.astype(np.float64), counts[there] / counts.sum())
 
     def recording(self) -> Recording:
         """Return the events as rows in order of their times, as if none had been late; a repeated event counts once.
@@ -156,7 +219,7 @@ class EventTable:
         """
         parts = []
         for place, name in enumerate([INPUTS, *self.network.names]):
-            time, _, sequence = self.columns[name].arrays()
+            time, _, sequence = self._arrays(name)
             parts.append(np.stack([time, np.full(len(time), place), sequence, np.arange(len(time))]))
         key = np.concatenate(parts, axis=1)
         key = key[:, np.lexsort(key[::-1])]

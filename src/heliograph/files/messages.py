@@ -60,7 +60,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
-    result = EventTable(network)
+    result = EventTable(network, sources.step)
     try:
         for number, row in _rows(path):
             where = f"{path}, row {number}"

@@ -15,7 +15,7 @@ import numpy as np
 
 from heliograph.files.recording import TIME_STEP
 from heliograph.live.event import INPUTS, whole
-from heliograph.numerics.check import fail, scalar, shown, text
+from heliograph.numerics.check import TINY, fail, scalar, shown, text
 from heliograph.numerics.dates import UNITS, dates, instant
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -42,6 +42,7 @@ class Source:
         time_unit: unit of a time that is a number.
         sequence: dotted path of the node's running count; None if there is none.
         plant: dotted path of the plant's name; None for a single plant.
+        step: seconds of a step where times are counted in steps; None where they are not.
     """
 
     paths: tuple[str, ...]
@@ -53,6 +54,7 @@ class Source:
     time_unit: TimeUnit
     sequence: str | None
     plant: str | None
+    step: float | None
 
 
 SourceTable: TypeAlias = Mapping[str, Source | Sequence[Source]]
@@ -63,12 +65,13 @@ def json_field(
     node: str,
     output: "str | Sequence[str] | None" = None,
     *,
-    scale: "Float[ArrayLike, '*output']" = 1.0,
-    offset: "Float[ArrayLike, '*output']" = 0.0,
+    scale: "ArrayLike" = 1.0,
+    offset: "ArrayLike" = 0.0,
     time: str | None = None,
     time_unit: "TimeUnit" = "s",
     sequence: str | None = None,
     plant: str | None = None,
+    step: float | None = None,
 ) -> "Source":
     """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
 
@@ -83,21 +86,23 @@ def json_field(
     A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive. A
     time is a date of ISO 8601 with its zone, a stamp of ROS, or a number since 1970 in `time_unit`; with the unit
     "step" it is a step of a network that counts steps. Without `time` a measurement is of the moment of its arrival.
+    With `step` the moments are counted in steps of so many seconds: each is of the nearest step, the first of step 0.
 
     Args:
         path: dotted path of the value, or of several, which are then one measurement.
         node: name of a node of the network, or "inputs".
         output: name of the output or input, one for each path; None for all of the node's, in their order.
-        scale: factor, of all values or of each.
-        offset: added after scaling, to all values or to each.
+        scale: factor, of all values or of each. Shape () or (values,).
+        offset: added after scaling, to all values or to each. Shape () or (values,).
         time: dotted path of the time; None for the moment of arrival.
         time_unit: unit of a time that is a number.
         sequence: dotted path of the node's running count; None if there is none.
         plant: dotted path of the plant's name; None if there is one plant.
+        step: seconds of a step of a network that counts steps, where times are dates; None for any other.
 
     Raises:
         ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
-            unit of time.
+            unit of time, a step that is not positive.
     """
     paths, outputs = _texts("path", path), () if output is None else _texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
@@ -107,8 +112,12 @@ def json_field(
     for name, value in {"node": node, "time": time, "sequence": sequence, "plant": plant}.items():
         if value is not None or name == "node":
             text(f"json_field, {name}", value)
+    if step is not None:
+        step = float(scalar("json_field, step", step, TINY))
+        if time_unit == "step":
+            raise fail("json_field, step", "none where the time is in steps already", step)
     factors, shifts = (_per_path(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset)))
-    return Source(paths, node, outputs, factors, shifts, time, time_unit, sequence, plant)
+    return Source(paths, node, outputs, factors, shifts, time, time_unit, sequence, plant, step)
 
 
 class Reading(NamedTuple):
@@ -144,12 +153,16 @@ class Sources:
     def __init__(self, table: object, network: Network):
         self.unknown = Counter[str]()  # messages of topics that are not in the table
         self.steps = TIME_STEP not in network.inputs
-        self._names = {name: tuple(network.nodes[name].received_names) for name in network.names}
-        self._names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
+        self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", shown(table))
         self._table = {topic: self._checked(topic, items) for topic, items in table.items()}
         self._known: dict[str, list[tuple[Source, np.ndarray]]] = {}
+        steps = {source.step for items in self._table.values() for source, _ in items}
+        if len(steps) > 1:
+            raise fail("sources, step", "the same of all", sorted(map(str, steps)))
+        self.step = next(iter(steps), None)
 
     @property
     def topics(self) -> list[str]:
@@ -179,7 +192,7 @@ class Sources:
         return [self._reading(source, places, message, where) for source, places in sources]
 
     def _reading(self, source: Source, places: np.ndarray, message: object, where: str) -> Reading:
-        values = np.full(len(self._names[source.node]), np.nan)
+        values = np.full(len(self.names[source.node]), np.nan)
         for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
             value = at(message, path, where)
             if type(value) is not float:  # names its place only where there may be something to say
@@ -207,9 +220,9 @@ class Sources:
         return [(source, self._places(f"sources, {topic!r}", source)) for source in sources]
 
     def _places(self, name: str, source: Source) -> np.ndarray:
-        if source.node not in self._names:
-            raise fail(f"{name}, node", f"one of {', '.join(self._names)}", _near(source.node, self._names))
-        known = self._names[source.node]
+        if source.node not in self.names:
+            raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _near(source.node, self.names))
+        known = self.names[source.node]
         outputs = source.outputs or known
         if len(outputs) != len(source.paths):
             raise fail(f"{name}, path", f"{len(known)} paths, for {', '.join(known)}, or output=", len(source.paths))
@@ -217,9 +230,10 @@ class Sources:
             if output not in known:
                 raise fail(f"{name}, output", f"one of {', '.join(known)}", _near(output, known))
         # Either all times are moments, or all are steps.
-        if self.steps != (source.time is not None and source.time_unit == "step"):
+        if self.steps != (source.step is not None or (source.time is not None and source.time_unit == "step")):
             expected = (
-                "a time field in steps (time=..., time_unit='step'), since the network counts steps: no input 'dt'"
+                "the seconds of a step (step=0.1), or a time field in steps (time=..., time_unit='step'), "
+                "since the network counts steps: no input 'dt'"
                 if self.steps
                 else "a time that is no step, since the network's time is continuous"
             )

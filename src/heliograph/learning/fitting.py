@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.description import Description, describe
-from heliograph.learning.free_marks import Build
+from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.likelihood.maximise import Maximum
-from heliograph.learning.likelihood.objective import Form, objectives
-from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.objective import Form, gathered, objectives
 from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution

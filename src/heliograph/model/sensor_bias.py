@@ -11,18 +11,18 @@ from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.traced import is_traced, library, scipy_for
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Vector
 
 
 def with_sensor_bias(
-    plant: AbstractPlant,
-    sensor: AbstractSensor,
-    deviation: "Float[ArrayLike, ' biases']",
-    time: "Float[ArrayLike, ' biases']" = np.inf,
-    dt: "Float[ArrayLike, ''] | str" = 1.0,
-    loading: "Float[ArrayLike, 'outputs biases'] | None" = None,
-) -> tuple[LinearPlant | Plant, LinearSensor | Sensor]:
+    plant: "AbstractPlant",
+    sensor: "AbstractSensor",
+    deviation: "ArrayLike",
+    time: "ArrayLike" = np.inf,
+    dt: "ArrayLike | str" = 1.0,
+    loading: "ArrayLike | None" = None,
+) -> "tuple[LinearPlant | Plant, LinearSensor | Sensor]":
     """Return plant and sensor with biases of the outputs as further states, y = h(x) + D b + v.
 
     Each is a Gauss-Markov process: b+ = exp(-dt / T) b + w with the standard deviation `deviation` at all times; of
@@ -31,8 +31,8 @@ def with_sensor_bias(
     Args:
         plant: the plant.
         sensor: its sensor.
-        deviation: standard deviation of each bias, or one number for all.
-        time: T, in which it is forgotten to 1/e, of each or of all.
+        deviation: standard deviation of each bias (biases,), or one number for all.
+        time: T, in which it is forgotten to 1/e, of each (biases,) or of all.
         dt: time of a step, or the name of the input that says it.
         loading: D, in which outputs each bias is (outputs, biases); one bias of each output by default.
 

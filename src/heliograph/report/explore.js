@@ -25,7 +25,7 @@
       [name, new Set(data.whole.includes(name) ? values[name] : values[name].slice(0, 1))]));
     sorted = {name: null, down: false};
     const ordered = dimensions.filter(name => name !== data.unordered);
-    options("y", data.quantities.map(one => one.name), data.quantities.map(one => one.label), data.quantities[0].name);
+    options("y", data.quantities.map(item => item.name), data.quantities.map(item => item.label), data.quantities[0].name);
     options("x", dimensions, dimensions, data.x);
     options("panel", ["", ...ordered], ["nothing", ...ordered], data.panel);
     options("colour", ordered, ordered, data.colour);
@@ -121,7 +121,7 @@
     const curves = panels.slice(0, PANELS).map(part => grouped(part, i => JSON.stringify(others.map(name => columns[name][i]))));
     const there = panels.reduce((sum, part) => sum + grouped(part, i => JSON.stringify(others.map(name => columns[name][i]))).length, 0);
     let left = CURVES;
-    const drawn = curves.map(part => { const kept = part.slice(0, left); left -= kept.length; return kept; }).filter(part => part.length);
+    const drawn = curves.map(part => { const shown = part.slice(0, left); left -= shown.length; return shown; }).filter(part => part.length);
     const count = drawn.reduce((sum, part) => sum + part.length, 0);
     at("shown").textContent = !rows.length ? "Nothing is chosen: tick a value in every list." :
       (count < there ? `${drawn.length} of ${panels.length} panels and ${count} of ${there} curves are shown; choose fewer values to see the others.` :
@@ -150,7 +150,7 @@
   }
 
   const across = i => { const x = at("x").value; return numeric(x) ? columns[x][i] : values[x].indexOf(columns[x][i]); };
-  const quantity = () => data.quantities.find(one => one.name === at("y").value);
+  const quantity = () => data.quantities.find(item => item.name === at("y").value);
 
   // One range for all panels, so that they compare and zoom together.
   function ranges(rows) {
@@ -226,7 +226,7 @@
     }));
   }
 
-  options("table", tables.map((_, i) => String(i)), tables.map(one => one.name), "0");
+  options("table", tables.map((_, i) => String(i)), tables.map(item => item.name), "0");
   at("table").parentElement.hidden = tables.length < 2;
   at("table").addEventListener("change", () => use(tables[at("table").value]));
   for (const id of ["x", "y", "panel", "colour"])

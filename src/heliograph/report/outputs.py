@@ -1,4 +1,4 @@
-"""Innovations of a run, output by output: how many values were down-weighted, their bias, and which output to blame."""
+"""Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters."""
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,10 +12,39 @@ from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import STRENGTH, Innovation
+from heliograph.model.estimate import STRENGTH, Innovation, weakest
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
+
+
+class Errors(NamedTuple):
+    """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
+
+    `claim` is what holds in all rows; `nees` is NaN where nothing is claimed.
+    """
+
+    node: str
+    filter: str
+    claim: str
+    rmse: dict[str, float]
+    nees: float
+
+
+def errors_of(record: Record) -> list[Errors]:
+    """Compare each filter with the truth; nothing without one."""
+    if record.truth is None:
+        return []
+    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
+    results = []
+    for node, estimates in record.estimates.items():
+        for name, estimate in estimates.items():
+            values = record.nees(node, name)
+            judged = ~np.isnan(values)
+            size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
+            claim = weakest(np.unique(estimate.claims).tolist())
+            results.append(Errors(node, name, claim, record.rmse(node, name), size))
+    return results
 
 
 class OutputHealth(NamedTuple):

@@ -23,7 +23,7 @@ class Takes(Protocol):
         """Return outputs that were committed before a restart and may not have been published."""
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Use messages and commit; return the outputs to publish."""
+        """Use messages and commit; return the outputs to publish. No messages: nothing came for a while."""
 
     def published(self, outputs: Sequence[Output]) -> None:
         """Note that these outputs were published; the next commit records it."""
@@ -44,27 +44,35 @@ async def keep_running(service: Takes, transport: Transport) -> None:
         await serve_until(stop, service, transport)
 
 
-async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport) -> None:
+async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport, patience: float | None = None) -> None:
     """Serve until the transport ends or `stop` is set; then commit and publish what was received.
 
     Args:
         stop: event that ends the loop.
         service: the service, which takes messages and returns outputs.
         transport: where messages come from and outputs go; it is closed at the end.
+        patience: seconds without messages after which the service takes that nothing came; None for never.
     """
     try:
         await _publish(service, transport, service.unpublished(), stop)
-        ended = await _serve(service, transport, stop)
+        ended = await _serve(service, transport, stop, patience)
         await _publish(service, transport, await asyncio.to_thread(service.finish, ended), stop)
         await asyncio.to_thread(service.finish, False)
     finally:
         await transport.close()
 
 
-async def _serve(service: Takes, transport: Transport, stop: asyncio.Event) -> bool:
+async def _serve(service: Takes, transport: Transport, stop: asyncio.Event, patience: float | None) -> bool:
     """Run the loop; return whether the transport ended."""
     while not stop.is_set():
-        batch = await _unless(stop, transport.receive())
+        # The next messages, or after a while that there are none.
+        waiting = asyncio.ensure_future(_unless(stop, transport.receive()))
+        try:
+            while not (await asyncio.wait({waiting}, timeout=patience))[0]:
+                await _publish(service, transport, await asyncio.to_thread(service.take, []), stop)
+        finally:
+            waiting.cancel()
+        batch = waiting.result()
         if batch is None:
             return not stop.is_set()
         outputs = await asyncio.to_thread(service.take, batch.payloads)

@@ -26,6 +26,7 @@ class Link:
         lost: gaps in the running count that no message has filled.
         used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
         dropped: single values beyond the limits of the node.
+        latest: time of the newest measurement that was used; -1 before the first.
     """
 
     first: int = -1
@@ -39,10 +40,13 @@ class Link:
     future: int = 0
     implausible: int = 0
     dropped: int = 0
+    latest: float = -1.0
 
     def count(self, verdict: Verdict, sequence: int, time: float) -> None:
         """Count one message. A late, implausible or future message was received too, so it fills a gap."""
         setattr(self, verdict, getattr(self, verdict) + 1)
+        if verdict == "used":
+            self.latest = max(self.latest, time)
         if verdict in ("duplicate", "conflict"):
             return
         if verdict in ("future", "implausible"):  # its time may be wrong: it says nothing of the order

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
-from heliograph.live.event import Verdict
+from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
@@ -119,9 +119,32 @@ class Service:
         """Use messages, each a JSON object or read already, and commit; return the outputs to publish.
 
         Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
+        Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
         """
         with _without_collection():
-            return self._take(payloads)
+            return self._take(payloads or self._silence(datetime.now(UTC)))
+
+    def _silence(self, now: datetime) -> list[Message]:
+        """Return that nothing came by now, for plants whose steps have dates: inputs that all stay as they were."""
+        results, step = list[Message](), self.fleet.options.step
+        if step is None or not self.fleet.deciding:
+            return results
+        # Plants of which the next step has begun.
+        for plant in self.plants.values():
+            last, nothing = int(plant.now), [None] * self.fleet.lanes.given
+            if plant.origin is not None and plant.origin + timedelta(seconds=step * (last + 1)) <= now:
+                results.append(
+                    Message.model_construct(
+                        plant=plant.name,
+                        node=INPUTS,
+                        sequence=last,
+                        time=now,
+                        values=nothing,
+                        inputs=None,
+                        arrival=None,
+                    )
+                )
+        return results
 
     def _take(self, payloads: Sequence[Payload]) -> list[Output]:
         begun = perf_counter()
@@ -265,7 +288,8 @@ class Service:
         ]
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
-        moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
+        unit = self.fleet.options.step or 1.0
+        moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
         senders = self.fleet.senders(plant) if kind == "provisional" else {}
         return self._writer.estimates(kind, plant.name, moment, outputs, senders)
 

@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, time
+from math import floor
 from typing import NamedTuple
 
 import numpy as np
@@ -96,9 +97,9 @@ class Using:
         plant = self.plants.get(message.plant)
         # A new plant begins with a message that is plausible and of a right clock.
         origin = self._origin(message) if plant is None else plant.origin
-        at = seconds(message.time, origin, message.plant)
+        at = self._number(message.time, origin, message.plant)
         now = at if plant is None else plant.now
-        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin, message.plant)
+        arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
@@ -132,6 +133,11 @@ class Using:
             notes.append(f"{beyond}; the rest is used")
         return Outcome(plant, verdict, why, tuple(notes))
 
+    def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
+        """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
+        at, step = seconds(moment, origin, plant), self.fleet.options.step
+        return at if origin is None or step is None else floor(at / step + 0.5)
+
     def _take(self, number: int, plant: Plant, event: Known) -> Verdict:
         verdict = self.fleet.take(plant, event)
         if verdict == "used":
@@ -156,7 +162,9 @@ class Using:
             self.fleet.end(self.plants.pop(name))
 
     def _origin(self, message: Message) -> datetime | None:
-        """Return midnight, UTC, before a plant's first message, if its times are dates and time is continuous."""
-        if not isinstance(message.time, datetime) or self.fleet.lanes.dt is None:
+        """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
+        if not isinstance(message.time, datetime):
             return None
+        if self.fleet.lanes.dt is None:
+            return None if self.fleet.options.step is None else message.time
         return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)

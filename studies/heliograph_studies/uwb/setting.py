@@ -97,9 +97,9 @@ class Errors(NamedTuple):
 
 def errors_of(rule: str, numbers: Numbers, anchors: int) -> Errors | None:
     """Errors with memory of a rule: none, a bias of each anchor, or one that is common and two of each anchor."""
-    every, each = np.ones(anchors), np.eye(anchors)
+    every, single = np.ones(anchors), np.eye(anchors)
     if rule.endswith(BIAS):
-        return Errors(numbers.constant * every, numbers.constant_time * every, each)
+        return Errors(numbers.constant * every, numbers.constant_time * every, single)
     if rule != BEST:
         return None
 
@@ -109,7 +109,7 @@ def errors_of(rule: str, numbers: Numbers, anchors: int) -> Errors | None:
     return Errors(
         stacked(numbers.common, numbers.constant, numbers.quick),
         stacked(numbers.common_time, numbers.constant_time, numbers.quick_time),
-        np.hstack([every[:, None], each, each]),
+        np.hstack([every[:, None], single, single]),
     )
 
 

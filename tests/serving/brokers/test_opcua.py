@@ -1,6 +1,7 @@
 """Values of an OPC UA server that the tests start: its deadband is read, asked for, and the sender's of a node."""
 
 import asyncio
+import json
 
 import pytest
 
@@ -9,10 +10,15 @@ from asyncua import Server, ua
 
 import heliograph as hg
 from heliograph.numerics.check import InputError
-from heliograph.serving.brokers.opcua import Reporting, read_reporting, reporting_of
+from heliograph.serving.brokers.listening import listen
+from heliograph.serving.brokers.opcua import OF_RANGE, Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import address
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.service import Service
+from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import free_port
 
 VARIABLE = "ns=2;s=Boiler.Temperature"
@@ -23,14 +29,20 @@ def network() -> hg.Network:
     return hg.Network(plant, {"boiler": hg.Node(hg.Sensor(lambda x: x, 0.1), hg.perfect(), {})})
 
 
-async def served(port: int) -> Server:
-    """A server with a variable that states a deadband of 0.5 and a sampling interval of 100 ms."""
+async def served(port: int, percent: bool = False) -> Server:
+    """A server with a variable that states a deadband of 0.5 and a sampling interval of 100 ms.
+
+    percent: the deadband is stated as 0.25 percent of a range of 200.
+    """
     server = Server()
     await server.init()
     server.set_endpoint(f"opc.tcp://127.0.0.1:{port}/plant")
     space = await server.register_namespace("heliograph")
     variable = await server.nodes.objects.add_variable(ua.NodeId("Boiler.Temperature", space), "Temperature", 20.0)
-    await variable.add_property(space, "ExceptionDeviation", 0.5)
+    await variable.add_property(space, "ExceptionDeviation", 0.25 if percent else 0.5)
+    if percent:
+        await variable.add_property(space, "ExceptionDeviationFormat", ua.Variant(OF_RANGE, ua.VariantType.Int32))
+        await variable.add_property(space, "EURange", ua.Range(-100.0, 100.0))
     await variable.write_attribute(
         ua.AttributeIds.MinimumSamplingInterval, ua.DataValue(ua.Variant(100.0, ua.VariantType.Double))
     )
@@ -79,6 +91,81 @@ def test_what_the_server_states_is_read_and_subscribed():
             await server.stop()
 
     asyncio.run(work())
+
+
+@pytest.mark.real("OPC UA")
+def test_a_deadband_in_percent_is_one_in_the_variables_unit():
+    async def work() -> None:
+        port = free_port()
+        server = await served(port, percent=True)
+        try:
+            result = await asyncio.to_thread(read_reporting, f"opc.tcp://127.0.0.1:{port}/plant", [VARIABLE])
+            assert result == {VARIABLE: Reporting(0.5, 0.1)}
+        finally:
+            await server.stop()
+
+    asyncio.run(work())
+
+
+@pytest.mark.real("OPC UA")
+def test_a_server_that_starts_again_is_subscribed_again():
+    """Its variable's value of then comes, as a stored message whose source dates it."""
+
+    async def work() -> None:
+        port = free_port()
+        server = await served(port)
+        sources = {VARIABLE: hg.files.json_field("value", "boiler", time="source_time")}
+        where = address(f"opc.tcp://127.0.0.1:{port}/plant", {})
+        transport = connected(where, translator=Translator(sources, network()))
+        try:
+            (first,) = (await asyncio.wait_for(transport.receive(), 30)).payloads
+            await server.stop()
+            server = await served(port)
+            await server.get_node(VARIABLE).write_value(25.0)
+            (second,) = (await asyncio.wait_for(transport.receive(), 60)).payloads
+            assert (first.values, second.values) == ([20.0], [25.0]) and second.time > first.time
+        finally:
+            await transport.close()
+            await server.stop()
+
+    asyncio.run(work())
+
+
+@pytest.mark.real("OPC UA")
+def test_a_change_is_a_step_of_a_node_whose_sender_has_the_deadband():
+    """Changes of a variable are dated; a network with a trigger counts steps, here of the sampling interval."""
+
+    async def work() -> None:
+        port = free_port()
+        server = await served(port)
+        url = f"opc.tcp://127.0.0.1:{port}/plant"
+        rule = (await asyncio.to_thread(read_reporting, url, [VARIABLE]))[VARIABLE]
+        plant, sensor = hg.LinearPlant([[1.0]], 0.01, [20.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
+        trigger = rule.trigger(heartbeat=600)
+        item = hg.event_filter(plant, sensor, hg.perfect(), trigger)
+        net = hg.Network(plant, {"boiler": hg.Node(sensor, hg.perfect(), {"f": item}, trigger=trigger)})
+        field = hg.files.json_field("value", "boiler", time="source_time", step=rule.interval)
+        translator = Translator({VARIABLE: field}, net)
+        fleet = Fleet(Lanes(net), Options(window=20.0, step=translator.sources.step))
+        service, transport = Service(fleet, InMemoryStore()), connected(address(url, {}), translator=translator)
+        try:
+            outputs = service.take((await asyncio.wait_for(transport.receive(), 30)).payloads)
+            await asyncio.sleep(1.0)
+            await server.get_node(VARIABLE).write_value(21.0)
+            outputs = service.take((await asyncio.wait_for(transport.receive(), 30)).payloads)
+            newest = json.loads(outputs[-1].body)
+            assert newest["kind"] == "provisional" and newest["senders"]["boiler"]["last"] >= 9
+            assert abs(newest["estimates"]["boiler"]["f"]["mean"][0] - 21.0) < 0.3
+        finally:
+            await transport.close()
+            await server.stop()
+
+    asyncio.run(work())
+
+
+def test_a_server_cannot_be_listened_to():
+    with pytest.raises(InputError, match=r"opc\.tcp://plc:4840/: expected mqtt:// or nats://, whose topics can be lis"):
+        listen(address("opc.tcp://plc", {}), 1.0)
 
 
 @pytest.mark.real("OPC UA")

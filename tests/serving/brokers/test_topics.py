@@ -3,8 +3,10 @@
 import asyncio
 import json
 import queue
+import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,11 +20,12 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 import heliograph as hg
+from heliograph import cli
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import connected
 from heliograph.serving.message import Message
-from heliograph_studies.live.server import Server
-from tests.serving.broker_servers import at, running
+from heliograph_studies.live.server import Server, free_port
+from tests.serving.broker_servers import KINDS, at, running
 
 NETWORK = """
 import jax.numpy as jnp
@@ -150,6 +153,53 @@ def test_subjects_of_nats_are_the_same_sources(server, translator):
         assert payloads[0].values == [18.0] and payloads[1].plant == "field-7" and payloads[2] == b"as it is"
 
     asyncio.run(work())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
+    """Twenty messages a second while it listens: their rate, the lateness of their date, and sources that run."""
+    where, stop = at(server, kind, "x"), threading.Event()
+
+    def send() -> None:
+        async def work() -> None:
+            client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
+            for k in range(1000):
+                measured = (datetime.now(UTC) - timedelta(seconds=2)).isoformat()
+                payload = json.dumps({"climate": {"temperature": 20 + k, "note": "ok"}, "last_seen": measured})
+                await client.publish("zigbee2mqtt.attic", payload.encode())
+                await client.publish("zigbee2mqtt.door", b"open")
+                await asyncio.sleep(0.05)
+                if stop.is_set():
+                    break
+            await client.close()
+
+        asyncio.run(work())
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        assert cli.main(["inspect", f"{kind}://{where.host}:{where.port}", "--seconds", "2"]) == 0
+    finally:
+        stop.set()
+        thread.join()
+    said = capsys.readouterr().out
+    row = re.search(r"zigbee2mqtt/attic +JSON +(\d+) +([0-9.]+) Hz +\S+ s +([0-9.]+)", said)
+    assert row is not None and int(row[1]) >= 10 and float(row[2]) < 25 and 2 <= float(row[3]) < 5
+    assert re.search(r"zigbee2mqtt/door +no JSON", said)
+    scope: dict[str, object] = {"hg": hg}
+    exec(said[said.index("sources = {") :], scope)
+    assert scope["sources"] == {
+        "zigbee2mqtt/attic": hg.files.json_field("climate.temperature", "NODE", "OUTPUT", time="last_seen")
+    }
+
+
+@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+def test_a_broker_that_is_not_there_is_one_line(capsys, monkeypatch, kind):
+    monkeypatch.setattr("heliograph.serving.brokers.listening.WAIT", 1.0)
+    url = f"{kind}://127.0.0.1:{free_port()}"
+    assert cli.main(["inspect", url]) == 2
+    said = capsys.readouterr().err
+    assert re.search(rf"broker {url}/\S*: expected a connection, got \S+", said) and said.count("\n") == 1
 
 
 @pytest.mark.real("MQTT")

@@ -3,6 +3,7 @@
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
@@ -147,8 +148,10 @@ def _check_region(trigger: AbstractThreshold, outputs: int, received: int, steps
     """Refuse what the sum of Gaussians does not carry."""
     if outputs == 1:
         return
-    if trigger.region == "ball":
-        raise fail("region of the trigger", '"box" or "each", which the filter can cut to', "ball")
+    if trigger.region == "ball" and outputs > MOST_COMPONENTS:
+        raise fail(
+            "outputs of a sensor behind a ball", f"{MOST_COMPONENTS} at most, for which a filter can cut to it", outputs
+        )
     if trigger.region == "each":
         if received != outputs:
             raise fail("channel of components that are each sent alone", f"{outputs} outputs", received)

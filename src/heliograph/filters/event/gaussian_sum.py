@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, join, log_total, reduced, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, moments_around
@@ -117,7 +118,12 @@ class EventFilter(AbstractSizedFilter):
     @property
     def _outside(self) -> int:
         """Parts of what is outside of a sender's region."""
-        return 1 if self.trigger.region == "ball" else 2 * (self.senders[0].stop - self.senders[0].start)
+        return 2 * len(range(self.outputs)[self.senders[0]]) + self.ball
+
+    @property
+    def ball(self) -> bool:
+        """True if the region is a ball of several components."""
+        return self.trigger.region == "ball" and self.outputs > 1
 
     @predicts
     def predict(self, state: EventBelief, u: ArrayLike = (), k: Step = 0) -> EventBelief:
@@ -282,17 +288,25 @@ class EventFilter(AbstractSizedFilter):
         """Cut to the region; its first component to a part of the interval, in units of delta."""
         for i, (direction, delta) in enumerate(self._errors(local)):
             low, high = part if i == 0 else (-1.0, 1.0)
-            parts = cut(parts, direction, low * delta, high * delta)
-        return parts
+            if not self.ball or (i == 0 and part != (-1.0, 1.0)):
+                parts = cut(parts, direction, low * delta, high * delta)
+        return self._cut_to_ball(parts, local, 1.0, True) if self.ball else parts
 
     def _outside_of(self, parts: Parts, local: slice, scale: float) -> list[Parts]:
-        """Cut to what is outside: the first component that is, above or below, those before it inside."""
+        """Cut to what is outside: the first component that is, above or below, those before it inside.
+
+        Of a ball these are the parts outside of the box around it, and what the ball leaves of the box.
+        """
         results = []
         for direction, delta in self._errors(local):
             edge = scale * delta
             results += [cut(parts, direction, edge, jnp.inf), cut(parts, direction, -jnp.inf, -edge)]
             parts = cut(parts, direction, -edge, edge)
-        return results
+        return [*results, self._cut_to_ball(parts, local, scale, False)] if self.ball else results
+
+    def _cut_to_ball(self, parts: Parts, local: slice, scale: float, inside: bool) -> Parts:
+        directions, deltas = zip(*self._errors(local), strict=True)
+        return cut_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
 
     def _or_nothing(self, parts: Parts, before: Parts) -> Parts:
         """The sum, or where the rule forbids what came that before it, with a floor as its likelihood."""

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.filters.event.truncated_normal import truncated_normal
+from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, Float
 
@@ -66,6 +67,7 @@ def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array |
 
     With c, S the mean and variance of d'x and k = P d / S:  w P(...), m + k sqrt(S) mu, P - k k' S (1 - v).
     """
+    above, below = (isinstance(end, float) and np.isinf(end) for end in (upper, lower))
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     # Law of d'x; without variance it lies inside or it does not.
     centre, column = parts.mean @ direction, parts.covariance @ direction
@@ -73,7 +75,14 @@ def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array |
     size = centre**2 + jnp.where(jnp.isfinite(upper), upper, 0.0) ** 2 + jnp.where(jnp.isfinite(lower), lower, 0.0) ** 2
     certain = variance <= CERTAIN * size
     deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
-    moments = truncated_normal((lower - centre) / deviation, (upper - centre) / deviation)
+    low, high = (lower - centre) / deviation, (upper - centre) / deviation
+    if above:
+        moments = upper_tail(low)
+    elif below:
+        moments = upper_tail(-high)
+        moments = moments._replace(mean=-moments.mean)
+    else:
+        moments = truncated_normal(low, high)
     inside = (lower <= centre) & (centre <= upper)
     log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
     gain = jnp.where(certain[:, None], 0.0, column / deviation[:, None])

@@ -13,6 +13,10 @@ NODES, WEIGHTS = (part / 2 for part in np.polynomial.legendre.leggauss(40))
 NODES = NODES + 0.5  # on (0, 1)
 
 
+FAR = 4.0  # from there the tail is a continued fraction, before it a complementary error function
+DEPTH = 32  # of the fraction, of which the variance at FAR has a relative error of 4e-14
+
+
 class TruncatedNormal(NamedTuple):
     """log P(lower <= e <= upper) of e ~ N(0, 1), and mean and variance of e in the interval."""
 
@@ -68,3 +72,32 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
 
     log_mass = -(t**2) / 2 + jnp.log(integral) - np.log(2 * np.pi) / 2
     return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
+
+
+def upper_tail(lower: jax.Array) -> TruncatedNormal:
+    """Log mass, mean and variance of N(0, 1) above `lower`: `truncated_normal` by a tenth of its operations.
+
+    With the hazard h = phi(a) / Q(a) the mean is h, the variance 1 - h (h - a). Far out both lose digits, but by
+    Laplace h = a + u_1 / a with u_n = n / (1 + u_{n+1} / a^2), and the variance is u_1 (u_2 - u_1) / a^2, which loses
+    none. The fraction is evaluated as numerator and denominator. Relative errors as of `truncated_normal`.
+
+    Shapes: any; the results have it.
+
+    Source: Laplace, Traite de mecanique celeste, vol. 4 (1805), the continued fraction of Mills' ratio.
+    """
+    # Near 0 or below it: Q = erfc(a / sqrt 2) / 2.
+    a = jnp.clip(lower, -40.0, FAR)
+    mass = jax.scipy.special.erfc(a / np.sqrt(2)) / 2
+    hazard = jnp.exp(-(a**2) / 2) / (np.sqrt(2 * np.pi) * mass)
+    near = TruncatedNormal(jnp.log(mass), hazard, 1 - hazard * (hazard - a))
+    # Far out.
+    a = jnp.maximum(lower, FAR)
+    x, above, below = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
+    for n in range(DEPTH, 1, -1):
+        above, below = n * below, below + x * above
+    second = above / below
+    first = 1 / (1 + x * second)
+    mean = a + first / a
+    log_mass = -(a**2) / 2 - np.log(2 * np.pi) / 2 - jnp.log(mean)
+    far = TruncatedNormal(log_mass, mean, x * first * (second - first))
+    return TruncatedNormal(*(jnp.where(lower < FAR, near_, far_) for near_, far_ in zip(near, far, strict=True)))

@@ -178,7 +178,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
         left = covariance_after(spread, cross, used, solved, observed, noise)
-        left = above_rounding(left, spread, self.mean**2 + np.diag(self.covariance))
+        left = above_rounding(left, spread, jnp.asarray(self.mean) ** 2 + jnp.diag(jnp.asarray(self.covariance)))
         after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 

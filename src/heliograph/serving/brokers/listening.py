@@ -76,6 +76,9 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
         if not item.subject.startswith(INTERNAL):
             note(topics, item.subject.replace(".", "/"), item.data, time.time_ns())
 
+    async def ignored(error: Exception) -> None:
+        """Leave out what the client would log with a traceback; what it raises is one line."""
+
     # Connect, listen for a while, and leave.
     try:
         client = await nats.connect(
@@ -86,6 +89,7 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
             tls=address.tls(),
             allow_reconnect=False,
             connect_timeout=int(WAIT),
+            error_cb=ignored,
         )
     except (Error, OSError, TimeoutError) as error:
         raise fail(f"broker {address}", "a connection", type(error).__name__) from None

@@ -87,8 +87,8 @@ class Translator:
             raise fail(f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", shown(reading.plant))
         time: datetime | float = arrival
         if reading.time is not None:
-            steps = self.sources.steps
-            time = float(reading.time) if steps else EPOCH + timedelta(microseconds=reading.time // 1000)
+            counted = self.sources.steps and self.sources.step is None
+            time = float(reading.time) if counted else EPOCH + timedelta(microseconds=reading.time // 1000)
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
             sequence = self._counts[name] if reading.time is None else 0

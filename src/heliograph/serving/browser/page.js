@@ -7,10 +7,10 @@ const MANY = 12; // rows of a table that can be read without a search
 let points = [], source = null, plant = null, chosen = null, last = null;
 
 function made(tag, text, name) {
-  const one = document.createElement(tag);
-  if (text !== undefined) one.textContent = text;
-  if (name) one.className = name;
-  return one;
+  const element = document.createElement(tag);
+  if (text !== undefined) element.textContent = text;
+  if (name) element.className = name;
+  return element;
 }
 
 function short(value, digits = 5) {
@@ -70,7 +70,7 @@ function choose(select, options, value, change) {
   const known = JSON.stringify(options);
   if (select.dataset.known !== known) {
     select.dataset.known = known;
-    select.replaceChildren(...options.map((name) => { const one = made("option", name || "(no name)"); one.value = name; return one; }));
+    select.replaceChildren(...options.map((name) => { const option = made("option", name || "(no name)"); option.value = name; return option; }));
   }
   select.value = value;
   select.onchange = () => change(select.value);
@@ -124,7 +124,7 @@ function charts(view) {
   at("charts").replaceChildren(...view.states.map((state, i) => chart(state, view.units[i], view.time_unit, drawn.map((point) => {
     const estimate = point.estimates[node] && point.estimates[node][filter];
     return estimate ? { time: point.time, final: point.final, mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0, claim: estimate.claim } : null;
-  }).filter((one) => one && Number.isFinite(one.mean)))));
+  }).filter((point) => point && Number.isFinite(point.mean)))));
 }
 
 function drawing(width, height) {
@@ -132,11 +132,11 @@ function drawing(width, height) {
   svg.setAttribute("viewBox", "0 0 " + width + " " + height);
   svg.setAttribute("role", "img");
   const add = (tag, name, values, text) => {
-    const one = document.createElementNS(SVG, tag);
-    one.setAttribute("class", name);
-    for (const [key, value] of Object.entries(values)) one.setAttribute(key, typeof value === "number" ? value.toFixed(1) : value);
-    if (text !== undefined) one.textContent = text;
-    svg.append(one);
+    const element = document.createElementNS(SVG, tag);
+    element.setAttribute("class", name);
+    for (const [key, value] of Object.entries(values)) element.setAttribute(key, typeof value === "number" ? value.toFixed(1) : value);
+    if (text !== undefined) element.textContent = text;
+    svg.append(element);
   };
   return [svg, add];
 }
@@ -174,7 +174,7 @@ function chart(name, unit, timeUnit, row) {
   const final = row.filter((p) => p.final), edge = (side) => (p) => [x(seconds(p.time)), y(p.mean + side * p.wide)];
   if (final.some((p) => p.wide)) add("path", "area", { d: line([...final.map(edge(1)), ...final.slice().reverse().map(edge(-1))]) + "Z" });
   if (final.length) add("path", "mean", { d: line(final.map(edge(0))) });
-  for (const p of row.filter((one) => !one.final)) {
+  for (const p of row.filter((point) => !point.final)) {
     const [cx, cy] = edge(0)(p);
     if (p.wide) add("line", "bar", { x1: cx, x2: cx, y1: edge(1)(p)[1], y2: edge(-1)(p)[1] });
     add("circle", "dot", { cx, cy, r: 2.5 });
@@ -184,19 +184,20 @@ function chart(name, unit, timeUnit, row) {
 }
 
 function row(name, cells) {
-  const one = made("tr"), head = made("th", name);
+  const element = made("tr"), head = made("th", name);
   head.scope = "row";
-  one.append(head, ...cells.map((cell) => (cell instanceof Node ? cell : made("td", cell))));
-  return one;
+  element.append(head, ...cells.map((cell) => (cell instanceof Node ? cell : made("td", cell))));
+  return element;
 }
 
 // Nodes in the order of their names; of many, those that the search names.
 function searched(view) {
   const nodes = order(new Set([...Object.keys(view.links), ...Object.keys(view.senders), ...view.tests.map((test) => test.node)]));
   at("search").hidden = nodes.length <= MANY;
-  const text = at("search").hidden ? "" : at("wanted").value.trim().toLowerCase();
+  const text = at("search").hidden ? "" : at("query").value.trim().toLowerCase();
   const some = nodes.filter((node) => node.toLowerCase().includes(text));
-  at("found").textContent = text ? some.length + " of " + nodes.length + " nodes" : nodes.length + " nodes";
+  const count = nodes.filter((node) => node !== "fused").length, matches = some.filter((node) => node !== "fused").length;
+  at("matches").textContent = text ? matches + " of " + count + " nodes" : count + " nodes";
   return some;
 }
 
@@ -212,9 +213,9 @@ function links(view) {
   at("sender").hidden = !deciding;
   at("links").replaceChildren(...some.filter((node) => view.links[node] || view.senders[node]).map((node) => {
     const link = view.links[node] || { used: 0, lost: 0, late: 0, duplicate: 0 };
-    const own = view.tests.filter((test) => test.node === node);
-    const doubted = own.some((test) => test.doubt);
-    const judged = made("td", own.length ? (doubted ? "doubtful" : "hold") : "", doubted ? "doubt" : "fine");
+    const checks = view.tests.filter((test) => test.node === node);
+    const doubted = checks.some((test) => test.doubt);
+    const judged = made("td", checks.length ? (doubted ? "doubtful" : "hold") : "", doubted ? "doubt" : "fine");
     const counts = [link.used, link.lost, link.late, link.duplicate];
     return row(node, [...counts.map((n) => n.toLocaleString("en")), judged, ...(deciding ? [status_of(view.senders[node])] : [])]);
   }));
@@ -236,7 +237,7 @@ function outputs(view) {
 }
 
 const listed = (names) => names.slice(0, 3).join(", ") + (names.length > 3 ? " and " + (names.length - 3) + " more" : "");
-at("wanted").oninput = () => { if (last) { links(last); tests(last); } };
+at("query").oninput = () => { if (last) { links(last); tests(last); } };
 window.addEventListener("resize", () => { if (last) charts(last); });
 const first = JSON.parse(at("first").textContent);
 if (first.points.length) show(first);

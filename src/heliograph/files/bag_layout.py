@@ -1,0 +1,225 @@
+"""Messages of a bag decoded many at once: fields whose places are fixed by the lengths of texts and lists."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from heliograph.files.event_table import EventTable
+from heliograph.files.sources import Source, Sources
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+NUMBERS = {f"{kind}{bits}": bits // 8 for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
+NUMBERS |= {"float32": 4, "float64": 8, "bool": 1}
+HEAD = 0x100  # of CDR, little end first: numbers are aligned to their size, counted from after these four bytes
+MOST_LENGTHS = 64  # in a message; one with more is decoded alone
+FEWEST = 5  # messages of a topic and size on average; where they are fewer each is decoded alone
+STAMP = ("sec", "nanosec")
+
+
+class RawMessage(NamedTuple):
+    """Message of a bag as it is stored: its topic with its type, the time it was logged in nanoseconds, its bytes."""
+
+    connection: "Connection"
+    logged: int
+    data: bytes
+
+
+class LayoutError(Exception):
+    """A message that is not of fixed places, or one that cannot be read: it is decoded alone, which says why."""
+
+
+class Layout:
+    """Places of the wanted fields in a message, and the lengths of texts and lists that put them there.
+
+    Messages of the same size with the same lengths at the same places have all fields at the same places.
+
+    Args:
+        definitions: fields by type of message, as rosbags has them.
+        kind: type of the message.
+        data: a message.
+        paths: dotted paths of the numbers to read.
+
+    Raises:
+        LayoutError: another encoding, a wanted field that is no number, a message that ends elsewhere.
+    """
+
+    def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
+        self._definitions, self._data, self._paths = definitions, data, paths
+        self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
+        self._length(0)
+        end = self._message(4, kind, "")
+        if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
+            raise LayoutError  # a message is filled up to four bytes at most
+
+    def fits(self, table: np.ndarray) -> np.ndarray:
+        """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
+        fits = np.ones(len(table), dtype=bool)
+        for place, length in self.lengths.items():
+            fits &= _column(table, place, "uint32") == length
+        return fits
+
+    def columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
+        """Return each wanted field of messages of this layout, (messages,)."""
+        return {path: _column(table, place, kind) for path, (place, kind) in self.fields.items()}
+
+    def _message(self, place: int, kind: str, prefix: str) -> int:
+        """Pass over a message from a place on; return where it ends, as all of these do."""
+        for name, (node, of) in self._definitions[kind][1]:
+            place = self._field(place, str(node.name), of, prefix + name)
+        return place
+
+    def _field(self, place: int, node: str, of: Any, path: str) -> int:
+        # Parts, texts and single numbers.
+        if node == "NAME":
+            return self._message(place, of, f"{path}.")
+        if node == "BASE" and of[0] == "string":
+            place = _aligned(place, 4)
+            return place + 4 + self._length(place)
+        if node == "BASE":
+            return self._numbers(place, of[0], 1, path, [path])
+        # Lists, of numbers or of anything else.
+        (part, inner), count = of
+        if node == "SEQUENCE":
+            place = _aligned(place, 4)
+            count, place = self._length(place), place + 4
+        if part.name == "BASE" and inner[0] in NUMBERS:
+            near = any(name.startswith(f"{path}.") for name in self._paths)
+            return self._numbers(place, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)])
+        for i in range(count):
+            place = self._field(place, part.name, inner, f"{path}.{i}")
+        return place
+
+    def _numbers(self, place: int, kind: str, count: int, path: str, names: list[str]) -> int:
+        size = NUMBERS.get(kind)
+        if size is None:
+            raise LayoutError
+        place = _aligned(place, size) if count else place
+        for i, name in enumerate(names):
+            if name in self._paths:
+                self.fields[name] = place + i * size, kind
+        return place + count * size
+
+    def _length(self, place: int) -> int:
+        length = int.from_bytes(self._data[place : place + 4], "little")
+        self.lengths[place] = length
+        if len(self.lengths) > MOST_LENGTHS or (place and place + 4 + length > len(self._data)):
+            raise LayoutError
+        return length
+
+
+class Decoder:
+    """Decoder of messages of mapped topics, many at once: values, stamps and counts as arrays.
+
+    Args:
+        reader: the bag.
+        sources: sources of the network.
+    """
+
+    def __init__(self, reader: "AnyReader", sources: Sources):
+        self._definitions, self._sources, self._little = reader.typestore.fielddefs, sources, reader.is2
+        self._layouts = defaultdict[tuple[str, int], list[Layout]](list)
+
+    def add(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
+        """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
+
+        What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
+        """
+        try:
+            readings = self._readings(batch)
+        except LayoutError:
+            return False
+        for node, parts in readings.items():
+            rows = np.concatenate([part.rows for part in parts])
+            order = np.argsort(rows, kind="stable")
+            logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
+            joined = (np.concatenate([getattr(part, name) for part in parts])[order] for name in Readings._fields[1:])
+            table.add_many(node, logged, *joined)
+        return True
+
+    def _readings(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
+        """Return the readings of each node, from the messages of one topic and size after another."""
+        if not self._little:
+            raise LayoutError
+        groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[Readings]](list)
+        for i, message in enumerate(batch):
+            groups[message.connection.topic, len(message.data)].append(i)
+        if FEWEST * len(groups) > len(batch):
+            raise LayoutError
+        for (topic, _), numbers in groups.items():
+            table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
+            for rows, columns in self._by_layout(batch[numbers[0]].connection, table):
+                for source, places in self._sources.of(topic):
+                    outputs = len(self._sources.names[source.node])
+                    read = _reading(np.array(numbers)[rows], columns, source, places, outputs)
+                    results[source.node].append(read)
+        return results
+
+    def _by_layout(
+        self, connection: "Connection", table: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Yield the rows of messages of one topic and size that have one layout, and the wanted fields of these."""
+        known = self._layouts[connection.topic, table.shape[1]]
+        left, place = np.arange(len(table)), 0
+        while len(left):
+            if place == len(known):
+                paths = {path for source, _ in self._sources.of(connection.topic) for path in _paths(source)}
+                known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
+            fits = known[place].fits(table[left])
+            yield left[fits], known[place].columns(table[left[fits]])
+            left, place = left[~fits], place + 1
+
+
+class Readings(NamedTuple):
+    """Readings of a node: numbers of their messages, times and counts (-1: the message has none), and values.
+
+    Shapes: rows, time and sequence (readings,), values (readings, outputs).
+    """
+
+    rows: np.ndarray
+    time: np.ndarray
+    sequence: np.ndarray
+    values: np.ndarray
+
+
+def _paths(source: Source) -> list[str]:
+    """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
+    if source.plant is not None or source.time_unit == "step":
+        raise LayoutError
+    stamp = [] if source.time is None else [f"{source.time}.{part}" for part in STAMP]
+    return [*source.paths, *stamp, *([] if source.sequence is None else [source.sequence])]
+
+
+def _reading(
+    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, outputs: int
+) -> Readings:
+    none = np.full(len(rows), -1, dtype=np.int64)
+    values = np.full((len(rows), outputs), np.nan)
+    for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+        value = columns[path].astype(np.float64)
+        values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
+    # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
+    time = none
+    if source.time is not None:
+        seconds, rest = (columns[f"{source.time}.{part}"] for part in STAMP)
+        time = seconds.astype(np.int64) * 10**9 + rest
+        if seconds.dtype.itemsize > 4 or np.any(time <= 0):
+            raise LayoutError
+    sequence = none if source.sequence is None else columns[source.sequence]
+    if sequence.dtype.kind not in "iu" or (source.sequence is not None and np.any(sequence.astype(np.int64) < 0)):
+        raise LayoutError
+    return Readings(rows, time, sequence.astype(np.int64), values)
+
+
+def _column(table: np.ndarray, place: int, kind: str) -> np.ndarray:
+    part = np.ascontiguousarray(table[:, place : place + NUMBERS[kind]])
+    return part.view(np.dtype(kind).newbyteorder("<"))[:, 0]
+
+
+def _aligned(place: int, size: int) -> int:
+    """Return the next place from this one on that a number of a size may have."""
+    return 4 + -(-(place - 4) // size) * size

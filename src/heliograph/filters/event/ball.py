@@ -1,0 +1,109 @@
+"""Moments of a Gaussian that is known to lie in a ball, or outside of it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.event.parts import CERTAIN, Parts
+from heliograph.filters.event.truncated_normal import truncated_normal
+from heliograph.numerics.linalg import eigh
+
+MOST_COMPONENTS = 3  # nodes are a grid over all but one of them
+REACH = 9.0  # deviations from the centre beyond which there is no probability that counts
+NODES, WEIGHTS = (part / 2 for part in np.polynomial.legendre.leggauss(32))
+NODES = NODES + 0.5  # on (0, 1)
+
+
+class BallMoments(NamedTuple):
+    """log P(e in the region), and mean (m,) and covariance (m, m) of e there."""
+
+    log_mass: jax.Array
+    mean: jax.Array
+    covariance: jax.Array
+
+
+def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Moments of independent e_i ~ N(centre_i, variance_i) where |e| <= radius, or where not.
+
+    Slices: given e_1 = radius sin(t) the others lie in a ball of radius cos(t) times as large, whose moments are those
+    of fewer components; the last is a truncated normal. 32 Gauss-Legendre nodes in t where e_1 has its probability. As
+    means and covariances of a mixture, so that no variance is negative.
+
+    Shapes: centre and variance (m,), variance positive; radius ().
+    """
+    if len(centre) == 1:
+        return _joined(_slice(centre[0], variance[0], radius, inside))
+    # Where e_1 lies inside of the radius: the moments of the others at each node.
+    first, deviation = centre[0], jnp.sqrt(variance[0])
+    near = jnp.clip(first, -radius, radius)
+    low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
+    angle = low + (high - low) * NODES
+    e = radius * jnp.sin(angle)
+    others = jax.vmap(lambda r: ball_moments(centre[1:], variance[1:], r, inside))(radius * jnp.cos(angle))
+    weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
+    weight = weight - ((e - first) / deviation) ** 2 / 2
+    mean = jnp.concatenate([e[:, None], others.mean], axis=1)
+    covariance = jnp.zeros((len(e), *variance.shape * 2)).at[:, 1:, 1:].set(others.covariance)
+    pieces = BallMoments(weight + others.log_mass, mean, covariance)
+    if inside:
+        return _joined(pieces)
+    # Where it does not: above and below, and the others anywhere.
+    tails = _slice(first, variance[0], radius, False)
+    mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
+    free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
+    wide = BallMoments(tails.log_mass, mean, free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
+    return _joined(BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True))))
+
+
+def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: bool) -> Parts:
+    """Each Gaussian cut to |D x| <= radius, or to where it is more, and the Gaussian of the same moments.
+
+    With S = Cov(D x) = V diag(s) V', e = V' D x has independent components, and for K = P D' V diag(s)^-1 the mean is
+    m + K (E e - V' D m), the covariance P - K (diag(s) - Cov e) K'.
+
+    Shapes: directions (m, N).
+    """
+
+    def single(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        column = covariance @ directions.T
+        variance, turn = eigh(directions @ column)
+        # What has no variance lies where it is.
+        centre, least = turn.T @ (directions @ mean), CERTAIN**0.5 * (radius**2 + jnp.sum((directions @ mean) ** 2))
+        known = variance > least
+        size = jnp.where(known, variance, least)
+        moments = ball_moments(centre, size, radius, inside)
+        gain = jnp.where(known, column @ turn / size, 0.0)
+        possible = jnp.isfinite(moments.log_mass)
+        shift = jnp.where(possible, moments.mean - centre, 0.0)
+        less = jnp.where(possible, jnp.diag(size) - moments.covariance, 0.0)
+        return moments.log_mass, mean + gain @ shift, covariance - gain @ less @ gain.T
+
+    log_mass, mean, covariance = jax.vmap(single)(parts.mean, parts.covariance)
+    return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
+
+
+def _slice(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """One component within the radius, (1, ...), or below and above it, (2, ...)."""
+    deviation = jnp.sqrt(variance)
+    edge = jnp.array([-1.0, 1.0]) * radius
+    low, high = (edge[:1], edge[1:]) if inside else (jnp.append(-jnp.inf, edge[1]), jnp.append(edge[0], jnp.inf))
+    moments = truncated_normal((low - centre) / deviation, (high - centre) / deviation)
+    possible = jnp.isfinite(moments.log_mass)
+    mean = jnp.where(possible, centre + deviation * moments.mean, centre)
+    spread = jnp.where(possible, variance * moments.variance, variance)
+    return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
+
+
+def _joined(pieces: BallMoments) -> BallMoments:
+    """Moments of the mixture of pieces."""
+    top = jnp.max(pieces.log_mass)
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    weight = jnp.exp(pieces.log_mass - top)
+    total = jnp.sum(weight)
+    share = jnp.where(total > 0, weight, 1.0) / jnp.where(total > 0, total, len(weight))
+    mean = share @ pieces.mean
+    apart = pieces.mean - mean
+    covariance = jnp.tensordot(share, pieces.covariance + apart[:, :, None] * apart[:, None], axes=1)
+    return BallMoments(top + jnp.log(total), mean, covariance)

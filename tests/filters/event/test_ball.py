@@ -1,0 +1,72 @@
+"""Moments of Gaussians in a ball and outside of it, beside a fine grid and beside draws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph.filters.event.ball import ball_moments, cut_to_ball
+from heliograph.filters.event.parts import Parts
+from heliograph.numerics.float64 import compiled
+
+
+def on_a_grid(centre, variance, radius, inside):
+    """Mass, mean and covariance by 400 Gauss-Legendre rings, smooth on either side of the circle."""
+    reach = np.sqrt(np.sum(np.square(centre))) + 12 * np.sqrt(max(variance))
+    edges = (0, radius) if inside else (radius, radius + reach)
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    r = edges[0] + (nodes + 1) / 2 * (edges[1] - edges[0])
+    angle = 2 * np.pi * np.arange(720) / 720
+    e = np.stack([r[:, None] * np.cos(angle), r[:, None] * np.sin(angle)])
+    square = sum((x - c) ** 2 / v for x, c, v in zip(e, centre, variance, strict=True))
+    weight = np.exp(-square / 2) / (2 * np.pi * np.sqrt(np.prod(variance))) * r[:, None]
+    weight *= weights[:, None] * (edges[1] - edges[0]) / 2 * 2 * np.pi / 720
+    mass = weight.sum()
+    mean = np.array([np.sum(weight * x) for x in e]) / mass
+    apart = e - mean[:, None, None]
+    return mass, mean, np.einsum("iab,jab,ab->ij", apart, apart, weight) / mass
+
+
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize(
+    ("centre", "variance"),
+    [((0.0, 0.0), (0.3, 0.8)), ((0.7, -0.4), (0.05, 2.0)), ((1.5, 0.2), (0.1, 0.1)), ((0.2, 0.1), (4.0, 0.02))],
+)
+def test_moments_of_two_components_are_those_of_a_grid(centre, variance, inside):
+    with jax.enable_x64(True):
+        result = ball_moments(jnp.array(centre), jnp.array(variance), jnp.array(1.0), inside)
+    mass, mean, covariance = on_a_grid(centre, variance, 1.0, inside)
+    # The rings are good to rounding; 32 slices to 1e-9 here.
+    assert np.exp(result.log_mass) == pytest.approx(mass, rel=1e-8)
+    np.testing.assert_allclose(result.mean, mean, atol=1e-8)
+    np.testing.assert_allclose(result.covariance, covariance, atol=1e-8)
+
+
+def test_three_components_are_those_of_draws():
+    """Five deviations of a mean of a million draws."""
+    centre, variance = np.array([0.3, -0.2, 0.5]), np.array([0.2, 0.5, 0.1])
+    draws = centre + np.sqrt(variance) * np.random.default_rng(0).normal(size=(10**6, 3))
+    within = np.sum(draws**2, axis=1) <= 1
+    for inside in (True, False):
+        with jax.enable_x64(True):
+            result = ball_moments(jnp.asarray(centre), jnp.asarray(variance), jnp.array(1.0), inside)
+        some = draws[within == inside]
+        assert np.exp(result.log_mass) == pytest.approx(len(some) / 1e6, abs=0.003)
+        np.testing.assert_allclose(result.mean, some.mean(axis=0), atol=0.006)
+        np.testing.assert_allclose(result.covariance, np.cov(some.T), atol=0.006)
+
+
+def test_inside_and_outside_are_the_whole_and_what_is_known_stays():
+    random = np.random.default_rng(1)
+    root = random.normal(size=(4, 4))
+    parts = Parts(np.zeros(1), random.normal(size=(1, 4)), (root @ root.T)[None], np.ones((1, 1, 1)))
+    directions = np.eye(4)[:2] - np.eye(4)[2:]
+    near, far = compiled(lambda r: tuple(cut_to_ball(parts, directions, r, side) for side in (True, False)))(1.5)
+    share = np.exp([near.log_weight[0], far.log_weight[0]])
+    assert share.sum() == pytest.approx(1, rel=1e-9)
+    mean = share @ np.stack([near.mean[0], far.mean[0]])
+    np.testing.assert_allclose(mean, parts.mean[0], atol=1e-8)
+    known = Parts(np.zeros(1), np.array([[0.5, 0.2, 0.0, 0.0]]), np.zeros((1, 4, 4)), np.ones((1, 1, 1)))
+    known_inside = compiled(lambda radius: cut_to_ball(known, directions, radius, True))
+    assert known_inside(1.0).log_weight[0] == pytest.approx(0, abs=1e-8) and known_inside(0.5).log_weight[0] < -1e3
+    np.testing.assert_array_equal(known_inside(1.0).mean, known.mean)
