@@ -11,17 +11,17 @@ from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.traced import is_traced, library, scipy_for
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Vector
 
 
 def with_sensor_bias(
     plant: "AbstractPlant",
     sensor: "AbstractSensor",
-    deviation: "ArrayLike",
-    time: "ArrayLike" = np.inf,
-    dt: "ArrayLike | str" = 1.0,
-    loading: "ArrayLike | None" = None,
+    deviation: "Float[ArrayLike, ' biases']",
+    time: "Float[ArrayLike, ' biases']" = np.inf,
+    dt: "Float[ArrayLike, ''] | str" = 1.0,
+    loading: "Float[ArrayLike, 'outputs biases'] | None" = None,
 ) -> "tuple[LinearPlant | Plant, LinearSensor | Sensor]":
     """Return plant and sensor with biases of the outputs as further states, y = h(x) + D b + v.
 

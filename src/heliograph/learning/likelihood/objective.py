@@ -224,20 +224,19 @@ def sole_filter(network: Network) -> AbstractFilter:
 
 
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
-    """Likelihood, scores and information at points of the line: native code, all points side by side, or XLA."""
-    rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
+    """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
+    data_rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
+    count, copies = len(data.measurements), (len(x), 1, 1)
+    runs = np.repeat(x, count, axis=0), *(np.tile(part, copies) for part in data_rows)
     with jax.enable_x64(True):
-        parts = [_at_points(objective, x, *row) for row in zip(*rows, strict=True)]
-    density, score, halves = zip(*parts, strict=True)
-    return Evaluation(np.stack(density, axis=1), np.stack(score, axis=1), np.sum(halves, axis=0))
-
-
-def _at_points(objective: Objective, x: np.ndarray, *rows: np.ndarray) -> Evaluation:
-    """Evaluate one recording at points, (points, ...)."""
-    choice = chosen(one_recording, (objective, x, *rows), [False, True, *(False for _ in rows)])
-    if choice.code is not None:
-        return choice.results()  # type: ignore[no-any-return]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *(to_numpy(_by_xla(objective, point, *rows)) for point in x))  # type: ignore[no-any-return]
+        choice = chosen(one_recording, (objective, *runs), [False, *(True for _ in runs)])
+        if choice.code is not None:
+            results = choice.results()
+        else:
+            parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
+            results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
+    return Evaluation(density, score, halves.sum(axis=1))
 
 
 def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
