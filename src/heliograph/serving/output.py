@@ -26,7 +26,7 @@ class Output(NamedTuple):
 
 
 class WeighedOutputs(BaseModel):
-    """What a filter that weighs its measurement made of each received number; null where none arrived.
+    """Innovations and weights of a filter that weighs, by received number; null where none arrived.
 
     Args:
         value: innovations, in the units of the numbers.

@@ -16,7 +16,7 @@ from heliograph.numerics.types import PyTree
 
 
 class Weighed(NamedTuple):
-    """What a filter that weighs its measurement made of each component: innovation, its variance, weight (m,) each."""
+    """Innovation of a filter that weighs, by component: value, variance and weight (m,) each."""
 
     value: jax.Array
     variance: jax.Array
