@@ -108,6 +108,7 @@ def _outputs(watch: Watch) -> Iterable[Metric]:
         name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])
         for name, words in what.items()
     }
+    # Numbers of each output of each filter that weighs; none where there are too few rows.
     for item in watch.outputs.health():
         numbers = output_numbers(item)
         for name, metric in metrics.items():

@@ -187,7 +187,8 @@ class Watch:
     ):
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused = dict(fused or {})
-        self.lock = threading.Lock()
+        # Of all plants together, of each plant, and histograms.
+        self.lock, self._count = threading.Lock(), 0
         self.services: list[Serves] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentOutputs(MEMORY, names or {})
@@ -195,7 +196,6 @@ class Watch:
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
-        self._count = 0
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
         what = "From when the oldest message of a batch was measured, where it has a date, to what is published."
