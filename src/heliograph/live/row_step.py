@@ -18,7 +18,7 @@ from heliograph.simulation.judging import implausible, plausible_step, step_with
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
-OUTPUTS = "estimates", "fused", "judged", "judged_centrally"
+OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally"
 TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
 
 
@@ -70,7 +70,7 @@ class NetworkStep(Module):
         """Step all filters, without implausible measurements; return the states and the outputs.
 
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
-        kind and "judged_centrally" by name.
+        kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
         after, result = plausible_step(self.filters, state, self.groups(received), u, k)
         return after, {name: result[name] for name in OUTPUTS}

@@ -23,10 +23,18 @@ class JudgementAt(NamedTuple):
     input: int
 
 
+class WeighedAt(NamedTuple):
+    """Columns of what a filter that weighs made of each of its components."""
+
+    value: tuple[int, ...]
+    variance: tuple[int, ...]
+    weight: tuple[int, ...]
+
+
 class Place(NamedTuple):
     """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 
-    `judgement` is None for a fusion rule, which receives no measurement.
+    `judgement` is None for a fusion rule, which receives no measurement; `weighed` of a filter that weighs nothing.
     """
 
     node: str
@@ -35,6 +43,7 @@ class Place(NamedTuple):
     mean: int
     covariance: int
     judgement: JudgementAt | None
+    weighed: WeighedAt | None
 
 
 class Lanes:
@@ -65,13 +74,26 @@ class Lanes:
         result = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
-        judged = self._judged(result)
+        judged, weighed = self._judged(result), self._weighed(result)
         return tuple(
             Place(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
-                  judged[node].get(name))
+                  judged[node].get(name), weighed.get((node, name)))
             for node, filters in self.network.claims().items()
             for name, claim in filters.items()
         )  # fmt: skip
+
+    def _weighed(self, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
+        """Return the columns of what each filter that weighs made of its components, by node and filter."""
+        parts = {
+            place: [np.asarray(part)[f, i] for part in outcome["weighed"][kind]]
+            for place, (kind, f, i) in self.network.places().items()
+            if outcome["weighed"][kind] is not None
+        }
+        central = {(FUSED, name): list(item) for name, item in outcome["weighed_centrally"].items() if item is not None}
+        return {
+            place: WeighedAt(*(tuple(map(int, part)) for part in columns))
+            for place, columns in (parts | central).items()
+        }
 
     def _judged(self, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
         """Return the columns of each part of a judgement, by node and filter."""

@@ -196,6 +196,7 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[st
     """Smoothed results where that was asked for, and what the filters judged."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
+    results = {name: part for name, part in results.items() if not name.startswith("weighed")}
     return (results if later is None else later.both(results)) | judged
 
 

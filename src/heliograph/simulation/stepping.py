@@ -129,6 +129,7 @@ class AllFilters(Module):
         Returns "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of fusions with quantizers, and
         "reports" with their delays by fusion, as the nodes send them; if asked for, the smoother steps,
         "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
+        "weighed" and "weighed_centrally" of those that weigh;
         `skip` has the reasons of the same form not to use data.
         """
         filter_states, central, quantizer_states, centre_states, reporting = states
@@ -187,6 +188,8 @@ class AllFilters(Module):
         if self.judges:
             outputs["judged"] = tuple(single.judgement for _, single in stepped)
             outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
+            outputs["weighed"] = tuple(single.weighed for _, single in stepped)
+            outputs["weighed_centrally"] = {name: single.weighed for name, (_, single) in received.items()}
         return following, outputs
 
     def _centred(
