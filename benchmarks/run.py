@@ -9,10 +9,10 @@ and every program has chosen its best width of a batch before.
 
 results.json: date, load (of the machine, before), machine, threads, and `comparisons` and `alone` by name.
 A comparison has title, unit, runs, steps, floor (arithmetic, memory), distance (ours over the larger), ours, and peers
-by title. Each of these has best, median, how, runs and versions; a peer also difference (None: it computes something
-else, as its title says), ratio, target and met, or only absent, the reason. Where another release was measured,
-old_release has its best and median, the difference, and how many times as long ours takes. A benchmark alone
-has unit, values, at_most and met.
+by title. Each of these has best, median, processors (the least time of all threads together), how, runs and versions; a
+peer also difference (None: it computes something else, as its title says), ratio, target and met, or only absent, the
+reason. Where another release was measured, old_release has its best and median, the difference, and how many times as
+long ours takes. A benchmark alone has unit, values, at_most and met.
 """
 
 import argparse
@@ -213,7 +213,9 @@ def alone(name: str, old: str | None) -> dict[str, Any]:
 def show_comparison(c: dict[str, Any]) -> None:
     print(f"\n{c['title']}\n{c['runs']:,} runs of {c['steps']} steps; {c['unit']}")
     print(f"  {'':<36}{'best':>11}{'median':>11}{'ratio':>9}{'target':>8}{'met':>5}{'difference':>12}")
-    print(f"  {'heliograph':<36}{c['ours']['best']:>11,.1f}{c['ours']['median']:>11,.1f}  {c['ours']['how']}")
+    ours = c["ours"]
+    print(f"  {'heliograph':<36}{ours['best']:>11,.1f}{ours['median']:>11,.1f}  {ours['how']}")
+    print(f"  {'of processors, all threads':<36}{ours['processors']:>11,.1f}")
     for title, p in c["peers"].items():
         if "absent" in p:
             print(f"  {title:<36}{p['absent']}")

@@ -67,6 +67,7 @@ CALLS = [  # what is called, and arguments with which it works
     (model.silent, {"outputs": 1, "inputs": 1, "noise": 0.1}),
     (model.OverTime, {"values": np.ones((3, 2))}),
     (model.with_bias, {"plant": SCALAR[0], "coupling": [[1.0]], "bias": SCALAR[0]}),
+    (model.with_sensor_bias, {"plant": SCALAR[0], "sensor": SCALAR[1], "deviation": 0.5, "time": 2.0, "dt": 0.1}),
     (model.RelayNetwork, {"plant": SCALAR[0], "sensor": SCALAR[1], "relays": ("r", "s"), "slots": SLOTS}),
     (random_affine.GainAndNoise, {"law": hg.Rayleigh(1.0), "matrix": EYE, "noise": 0.1}),
     (random_affine.known, {"matrix": EYE}),

@@ -25,7 +25,8 @@ def prepare(p: Arrays) -> Contender:
         last, means = jax.lax.scan(step, start, z)
         return means, last.covariance
 
-    return Contender(lambda: hg.simulation.over_runs(one_run, p["z"]), lambda result: result[0], "over_runs, all cores")
+    how = f"over_runs, all cores; {hg.codegen.engine_of(one_run, p['z'])}"
+    return Contender(lambda: hg.simulation.over_runs(one_run, p["z"]), lambda result: result[0], how)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,8 @@ def prepare(p: Arrays) -> Contender:
     planned = hg.smoothing.planned_smoother(
         hg.kalman_filter(plant, sensor), p["z"].shape[1], hg.smoothing.FixedInterval()
     )
-    return Contender(
-        lambda: hg.simulation.over_runs(planned.means, p["z"]), lambda result: result, "over_runs, all cores"
-    )
+    how = f"over_runs, all cores; {hg.codegen.engine_of(planned.means, p['z'])}"
+    return Contender(lambda: hg.simulation.over_runs(planned.means, p["z"]), lambda result: result, how)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """The form of every program: read a problem, write the estimates, then time one pass for each line on standard input.
 
 Usage: python PROGRAM problem.npz means.npy. The first line out tells runs and versions; each later one nanoseconds per
-step and run. The driver asks the programs in turn, so that a disturbance of the machine meets all of them.
+step and run, by the clock and of processors. The driver asks the programs in turn, so that a disturbance of the machine
+meets all of them.
 """
 
 import json
@@ -34,7 +35,9 @@ def serve(prepare: Callable[[Arrays], Contender], packages: tuple[str, ...]) -> 
     about = {"how": contender.how, "runs": len(means), "versions": {name: version(name) for name in packages}}
     print(json.dumps(about), flush=True)
     for _ in sys.stdin:
-        print(json.dumps(1e9 * seconds(contender.work) / means[..., 0].size), flush=True)
+        worked = time.process_time()
+        taken = seconds(contender.work), time.process_time() - worked
+        print(json.dumps([1e9 * x / means[..., 0].size for x in taken]), flush=True)
 
 
 def seconds(work: Callable[[], Any]) -> float:

@@ -120,7 +120,7 @@ from .simulation.results.record import (
 from .simulation.results.sums import (
     Statistics as Statistics,
 )
-from .learning.free_marks import (
+from .learning.description import (
     free as free,
 )
 from .learning.fitting import (

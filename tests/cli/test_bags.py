@@ -1,5 +1,6 @@
 """`heliograph run` and `inspect` on bags: estimates in tables and in MCAP, what is listed, what is refused."""
 
+import json
 import re
 
 import numpy as np
@@ -120,3 +121,38 @@ def test_a_bag_of_another_hand(folder, capsys):
     events = list(table.in_order())
     np.testing.assert_array_equal([e.values[0] for e in events], [0.1 * k for k in range(20)])
     np.testing.assert_allclose(table.lateness()["gps"], 0.05, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_noise_of_a_bag_is_learned(folder, capsys):
+    """300 steps of a tenth of a second: the interval of the measurement's noise, 95 %, has the truth of 0.04 in it."""
+    random = np.random.default_rng(3)
+    x = np.cumsum(0.3 * random.standard_normal(300)) + 0.2 * random.standard_normal(300)
+    times = bags.START + np.arange(300) * 10**8
+    messages = [
+        (t + 10**6, "/odometry", bags.ODOMETRY, bags.odometry(t, v)) for t, v in zip(times.tolist(), x, strict=True)
+    ]
+    bags.write(folder / "walk", messages)
+    (folder / "free.py").write_text(
+        "import heliograph as hg\n\ndef network():\n"
+        "    plant = hg.LinearPlant([[1.0]], 0.09, [0.0], 1.0)\n"
+        "    sensor = hg.LinearSensor([[1.0]], hg.free(0.1, 'noise'))\n"
+        "    node = hg.Node(sensor, hg.perfect(), {'filter': hg.kalman_filter(plant, sensor)})\n"
+        "    return hg.Network(plant, {'gps': node})\n\n"
+        "sources = {'/odometry': hg.files.json_field('pose.pose.position.x', 'gps', time='header.stamp', step=0.1)}\n"
+    )
+    command = [
+        "fit",
+        "free.py:network",
+        "--measurements",
+        "walk/walk.mcap",
+        "--out",
+        "out",
+        "--starts",
+        "1",
+        "--held-out",
+        "0",
+    ]
+    assert cli.main(command) == 0, capsys.readouterr().err
+    (row,) = json.loads((folder / "out" / "fitted.json").read_text())["table"]
+    assert row["low"] <= 0.04 <= row["high"] < 0.15

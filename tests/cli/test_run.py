@@ -37,6 +37,8 @@ def test_run_writes_what_the_library_computes(folder, capsys):
 
 def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0
+    written = "out.csv and page/report.html: 4 rows of remote/aware (nominal), remote/trusting (nominal)\n"
+    assert capsys.readouterr().out == written
     assert (folder / "page" / "smoothed_0.png").is_file() and "given later data too" in (
         folder / "page" / "report.html"
     ).read_text()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.accumulated import Accumulated
-from heliograph.codegen.program import Summed, folded, lower, row_length, scalars
+from heliograph.codegen.lowering import scalars
+from heliograph.codegen.program import Summed, folded, lower, row_length
 from heliograph.codegen.rules.arrived import arrived
 
 BATCHES, STEPS = 50, 4

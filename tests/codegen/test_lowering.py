@@ -8,8 +8,8 @@ import pytest
 import heliograph as hg
 from heliograph.codegen.engine import engine_of
 from heliograph.codegen.graph import Graph, Unsupported
-from heliograph.codegen.lowering import Lowering, traced
-from heliograph.codegen.program import lower, needed, scalars
+from heliograph.codegen.lowering import Lowering, scalars, traced
+from heliograph.codegen.program import lower, needed
 
 
 def folded(function, *arguments):

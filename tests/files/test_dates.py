@@ -9,8 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.files.columns import columns_of
-from heliograph.files.table import read_table, write_table
+from heliograph.files.table import columns_of, read_table, write_table
 from heliograph.numerics.dates import dates, in_iso, instant, seconds_between
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])

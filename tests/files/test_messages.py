@@ -1,9 +1,15 @@
 """Messages of bags and of CSV files as events: times of measuring and logging, rows, and what ends a reading early."""
 
 import re
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
+
+pytest.importorskip("rosbags")
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import heliograph as hg
 from heliograph.files.network_file import load_module
@@ -216,3 +222,18 @@ def test_dates_become_steps_of_a_network_that_counts_them(tmp_path):
         with pytest.raises(ValueError, match=words):
             field = hg.files.json_field("value", "a", time="at", **changed)
             hg.files.read_messages(tmp_path / "log.csv", network, {"log.csv": field})
+
+
+def test_a_type_that_the_bag_does_not_define_is_one_line(world, tmp_path):
+    """An SQLite bag without definitions, as of earlier releases of ROS, with a type of somebody's own."""
+    network, *_ = world
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("float64 level", "tank/msg/Level"))
+    with Writer(tmp_path / "old", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        topic = writer.add_connection("/tank", "tank/msg/Level", typestore=store)
+        writer.write(topic, bags.START, store.serialize_cdr(store.types["tank/msg/Level"](1.0), "tank/msg/Level"))
+    (file,) = (tmp_path / "old").glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("DELETE FROM message_definitions")
+    with pytest.raises(ValueError, match=r"/tank: expected a message type that the bag defines, got 'tank/msg/Level'"):
+        hg.files.read_messages(tmp_path / "old", network, {"/tank": hg.files.json_field("level", "gps")})

@@ -6,7 +6,6 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.later import Sweeper
-from heliograph.live.player import player
 
 GAPS = {"a": (3, 5, 11), "b": (3, 5, 7, 11)}  # two of them at both nodes, one at the end
 
@@ -80,5 +79,5 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
     both = {"f": gains, "linear": hg.linear_filter(plant, sensor, hg.perfect())}
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
     others = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
-    smoothed = Sweeper(others, None, player(others).structure).item
+    smoothed = Sweeper(others, None).item
     assert smoothed.fusions == () and [others.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.senders import lost_in_a_row
+from heliograph.live.senders import LossChain
 
 PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
 LOSSY = hg.erasure(hg.perfect(), 0.8)
@@ -70,12 +70,34 @@ def test_what_is_known_of_a_sender_is_saved():
     assert again.senders() == line.senders() and again.senders()["a"].last == 0
 
 
+def chain(channel):
+    """Losses of a link, of which a node and an event filter say the same."""
+    node = network(channel).nodes["a"]
+    result, other = LossChain.of_node(node), LossChain.of_filter(node.filters["f"])
+    for part, same in zip(result, other, strict=True):
+        np.testing.assert_allclose(part, same, rtol=1e-12)
+    return result
+
+
+def test_a_stream_says_which_steps_are_silent_and_whether_its_sender_is_dead():
+    stream = hg.Stream(network(hg.perfect()).nodes["a"].filters["f"])
+    for value in (0.2, np.nan, 1.0, np.nan, np.nan, np.nan, np.nan):
+        stream.push([value])
+    status = stream.sender()
+    assert (status.last, status.silent, status.provisional, status.missed, status.dead) == (2, 4, 0, 0, False)
+    again = hg.Stream.restore(stream.filter, stream.save())
+    again.push([np.nan])
+    assert again.sender().missed == 1 and again.sender().dead and not stream.sender().dead
+    with pytest.raises(ValueError, match="filter of a stream: expected one of event_filter, whose sender decides"):
+        hg.Stream(hg.kalman_filter(PLANT, SENSOR)).sender()
+
+
 def test_losses_in_a_row_by_modes():
     """Down with probability .2 and for 5 steps on average: h steps later still (or again) down with p + (1-p) r^h."""
     bursts = hg.gilbert_elliott(LOSSY.base, LOSSY.base, 0.05, 0.2)
     link = hg.gilbert_elliott(hg.erasure(hg.perfect(), 1.0), hg.erasure(hg.perfect(), 0.0), 0.05, 0.2)
-    assert lost_in_a_row(bursts, 3, 2) == 0.0
-    assert lost_in_a_row(link, 4, 2) == pytest.approx(0.2 * (0.2 + 0.8 * 0.75**4))
+    assert chain(bursts).in_a_row(3, 2) == 0.0
+    assert chain(link).in_a_row(4, 2) == pytest.approx(0.2 * (0.2 + 0.8 * 0.75**4))
 
 
 def test_a_trigger_in_continuous_time_and_no_trigger_are_refused_in_one_line():

@@ -78,3 +78,15 @@ def test_further_axes_are_carried_along():
         np.testing.assert_allclose(linalg.trace(a_last), np.trace(a, axis1=1, axis2=2), rtol=ROUNDING)
         result = np.moveaxis(np.asarray(linalg.congruence(a_last, b_last)), -1, 0)
     np.testing.assert_allclose(result, a @ b @ np.swapaxes(a, 1, 2), atol=ROUNDING * np.abs(result).max())
+
+
+def test_less_than_nothing_by_the_rounding_of_several_products_is_nothing():
+    """A determinant of -5e-6 is forty units of single precision, as of a tied prior moved four steps.
+
+    In double precision it is no rounding, and the matrix is indefinite.
+    """
+    a = np.array([[1.0, 1.0], [1.0, 1.0 - 5e-6]])
+    with jax.enable_x64(True):
+        single, double = linalg.root(jnp.asarray(a, jnp.float32)), linalg.root(jnp.asarray(a))
+    np.testing.assert_array_equal(single, [[1.0, 0.0], [1.0, 0.0]])
+    assert np.isnan(double[1, 1])

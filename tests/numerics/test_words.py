@@ -43,6 +43,16 @@ def test_a_line_says_what_to_write(make, line):
     assert str(error.value) == line
 
 
+@pytest.mark.parametrize(
+    ("name", "offered"),
+    [("UKF", "unscented_filter"), ("ekf", "extended_filter"), ("KF", "kalman_filter"), ("batch", "run"),
+     ("KalmanFilter", "kalman_filter"), ("filter", "kalman_filter")],
+)  # fmt: skip
+def test_what_others_call_it_is_offered_by_its_name_here(name, offered):
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}'; closest: {offered}\b"):
+        getattr(hg, name)
+
+
 def test_a_sensor_in_numpy_is_said_to_be_in_jax():
     plant = hg.LinearPlant(np.eye(2), 0.1, [0.0, 0.0], 1.0)
     sensor = hg.Sensor(lambda x: np.array([np.sin(x[0])]), 0.1)

@@ -42,6 +42,12 @@ def test_one_sided_noise_has_mean_and_variance_of_an_exponential_delay():
     np.testing.assert_allclose([law.mean[0], law.covariance[0, 0]], [0.6, 1.5 + 0.3 * 8 - 0.36], rtol=1e-12)
 
 
+def test_share_and_delay_of_a_one_sided_law_can_be_free():
+    """d/d(share) of the mean, share times the delay's mean."""
+    slope = jax.grad(lambda share: hg.Contaminated.one_sided(1.5, share, 2.0).mean[0])(0.3)
+    assert np.isclose(slope, 2.0, rtol=1e-6)  # in single precision
+
+
 @pytest.mark.parametrize("nu", [2.0, 3.0, 5.0])
 def test_branches_of_students_law_have_its_density(nu):
     """To 0.08 in the logarithm within 100 scales: what 25 precisions over 5.7 decades give for 2 to 5 degrees."""

@@ -14,9 +14,11 @@ import heliograph as hg
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.output import AnyOutput
+from heliograph.serving.page import Tallies
 from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.serving.watch import watch_of
 from tests.losing import Losing
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
@@ -162,6 +164,40 @@ BAD = {
     b"\xff\xfe": "",
     b"[" * 5000: "",
 }
+
+
+def test_robust_and_adaptive_filters_say_what_they_made_of_each_number():
+    """Innovations and weights of a service are those of the filters over the same rows; the broken output is to blame.
+
+    Equal to 1e-9 of numbers of order one, from two programs that are compiled apart.
+    """
+    plant = hg.LinearPlant(0.9 * np.eye(2), 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["x", "v"])
+    sensor = hg.LinearSensor(np.eye(2), 0.1 * np.eye(2), outputs=["left", "right"])
+    robust = hg.robust_filter(plant, sensor, hg.perfect(2), hg.filters.Gate(30.0))
+    filters = {"robust": robust, "adaptive": hg.adaptive_filter(robust), "kalman": hg.kalman_filter(plant, sensor)}
+    network = hg.Network(plant, {"radio": hg.Node(sensor, hg.perfect(2), filters)})
+    z = 0.3 * np.random.default_rng(0).normal(size=(60, 2))
+    z[::4, 0] += 15.0
+    z[5, 1] = np.nan
+    watch = watch_of(network, "tank")
+    service = watch.over(Service(Fleet(Lanes(network), Options(WINDOW)), InMemoryStore()))
+    values = [[None if np.isnan(x) else x for x in row] for row in z.tolist()]
+    sent = [{"node": "radio", "sequence": k, "time": k, "values": row} for k, row in enumerate(values)]
+    outputs = service.take(lines(sent))
+    known = finals([json.loads(item.body) for item in outputs], outputs[0].plant)
+    assert len(known) > 40 and known[0]["estimates"]["radio"]["kalman"].get("outputs") is None
+    for name in ("robust", "adaptive"):
+        item = filters[name].run(z)
+        rows = [message["estimates"]["radio"][name]["outputs"] for message in known]
+        for part, expected in (("value", item.innovations), ("weight", item.weights)):
+            got = np.array([row[part] for row in rows], dtype=float)
+            np.testing.assert_allclose(got, expected[: len(got)], rtol=1e-9, atol=1e-9)
+    said = {(row["filter"], row["output"]): row for row in watch.view(None)["outputs"]}
+    assert set(said) == {(name, output) for name in ("robust", "adaptive") for output in ("left", "right")}
+    assert said["robust", "left"]["to_blame"] and not said["robust", "right"]["to_blame"]
+    assert "down-weighted" in said["robust", "left"]["words"]
+    text = Tallies(watch).text().decode()
+    assert 'heliograph_output_share{filter="robust",node="radio",output="left"}' in text
 
 
 def test_what_is_bad_is_said_and_changes_nothing():

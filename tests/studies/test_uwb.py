@@ -8,7 +8,8 @@ import pytest
 
 from heliograph_studies import uwb
 from heliograph_studies.uwb.drives import drives
-from heliograph_studies.uwb.learning import slots
+from heliograph_studies.uwb.learning import followed, learn, padded, slots
+from heliograph_studies.uwb.setting import STARTS
 
 ANCHORS = np.array([[2.5, 0.9, 2.0], [2.5, -0.9, 2.0], [-2.5, -0.9, 0.5], [-0.7, 0.9, 0.5]])
 NAMES = (3, 5, 9, 12)
@@ -86,6 +87,23 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path, write_bad, messag
     assert "\n" not in str(caught.value)
 
 
+def test_drives_with_other_anchors_teach_each_other(tmp_path):
+    """One drive lacks an anchor in its tables: it is read, and its rows are those that it has alone."""
+    rows, truth = made(0, 20.0)
+    as_tables(tmp_path / "nlos_a9", rows, truth)
+    few = rows[rows[:, 1] != NAMES[2]]
+    as_tables(tmp_path / "los_c2", few, truth)
+    write(tmp_path / "los_c2" / "anchors.csv", ["anchor", "x", "y", "z"],
+          [[n, *a] for n, a in zip(NAMES, ANCHORS, strict=True) if n != NAMES[2]])  # fmt: skip
+    both = drives(tmp_path)
+    assert [len(drive.places) for drive in both] == [3, 4]
+    numbers = [STARTS["huber"]] * 2
+    together = followed("huber", numbers, padded(both))
+    alone = followed("huber", numbers[:1], padded(both[:1]))
+    np.testing.assert_allclose(together.place[0], alone.place[0], rtol=1e-12)
+    assert learn("gate", [], 6) == STARTS["gate"]  # a drive alone
+
+
 @pytest.mark.slow
 def test_the_example_writes_errors_claims_and_who_is_to_blame(tmp_path):
     """Two drives that teach each other; errors of 0.3 m and a NEES within a factor of four are far from both limits."""
@@ -97,7 +115,7 @@ def test_the_example_writes_errors_claims_and_who_is_to_blame(tmp_path):
         assert drive["published"] == {"ls": None, "eskf": None}
         best, plain = drive["rules"]["memory"], drive["rules"]["plain"]
         assert best["rmse"] < 0.3 and 0.25 < best["nees"] < 4
-        assert best["rmse"] < plain["rmse"]
+        assert best["rmse"] < plain["rmse"] and drive["rules"].keys() == STARTS.keys()
         assert 0.05 < drive["losses"]["loss"] < 0.12
     page = (tmp_path / "out" / "uwb" / "report.html").read_text()
     assert "down-weighted" in page and "los_b2" in page

@@ -167,29 +167,19 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
 
     world: bool = eqx.field(static=True, default=False)
 
-    def initial(self, shapes: PyTree) -> PyTree:
-        """Return an empty carry: nothing is summed."""
-        return ()
-
-    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Collect the errors of a block."""
+    def of_step(self, step: PyTree) -> OfStep:
+        """Collect the errors of one step."""
         recorded = {
             part: jax.tree.map(
-                lambda estimate: _errors(batch["truth"], estimate),
-                batch[part],
+                lambda estimate: _errors(step["truth"], estimate),
+                step[part],
                 is_leaf=lambda leaf: isinstance(leaf, Estimate),
             )
             for part in ("estimates", "fused")
         }
         if self.world:
-            recorded |= {name: batch[name] for name in ("truth", "measurements")}
-        return carry, recorded
-
-    def of_step(self, step: PyTree) -> OfStep:
-        """Collect the errors of a block of one run and one step."""
-        block = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None, None], step)
-        _, recorded = self.reduce((), block, jnp.zeros(1), jnp.ones(1, dtype=bool))
-        return OfStep(collected=jax.tree.map(lambda leaf: leaf[0, 0], recorded))
+            recorded |= {name: step[name] for name in ("truth", "measurements")}
+        return OfStep(collected=recorded)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Arrange the collected errors by node and filter."""
@@ -208,9 +198,7 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
 
 
 def _errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    mean, covariance = jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
-    error = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), -1) - mean
+    error, covariance = truth - jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
-    matrix, e = jnp.moveaxis(covariance, (-2, -1), (0, 1)), jnp.moveaxis(error, -1, 0)
-    nees = squared_distance(matrix.transpose(0, 1, *range(3, matrix.ndim), 2), e.transpose(0, *range(2, e.ndim), 1))
-    return {"error": error, "variance": variance, "nees_per_dimension": jnp.moveaxis(nees, -1, 0) / error.shape[-1]}
+    nees = squared_distance(jnp.moveaxis(covariance, (-2, -1), (0, 1)), jnp.moveaxis(error, -1, 0))
+    return {"error": error, "variance": variance, "nees_per_dimension": nees / len(truth)}

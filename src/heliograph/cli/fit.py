@@ -62,7 +62,7 @@ def fit(
 def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
-    from heliograph.cli.mapped import read_mapped
+    from heliograph.cli.run import read_mapped
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.network_file import load_module
     from heliograph.files.recording import Recording, read_recording

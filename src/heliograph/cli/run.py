@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from collections.abc import Mapping
 from importlib import import_module
 from math import isnan
 from pathlib import Path
@@ -18,9 +19,30 @@ if TYPE_CHECKING:
     from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
+    from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
+
+
+def read_mapped(
+    measurements: Path, reference: str, network: "Network", module: Mapping[str, object], advance: "Advance"
+) -> "EventTable | None":
+    """Read the messages of a bag, or of a CSV file of which the sources name the topics; None for any other table."""
+    from heliograph.files.messages import is_mapped, read_messages
+    from heliograph.numerics.check import fail
+
+    sources = module.get("sources")
+    if not is_mapped(measurements, sources):
+        return None
+    if sources is None:
+        hint = f"heliograph inspect {measurements} --network {reference} suggests them"
+        raise fail(f"network {reference}", f"sources, for the topics of {measurements} ({hint})", "none")
+
+    def progress(done: int, total: int) -> None:
+        advance(f"reading {measurements.name}", done, total)
+
+    return read_messages(measurements, network, sources, progress)
 
 
 def run(
@@ -47,7 +69,7 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.cli.mapped import read_mapped
+    from heliograph.cli.run import read_mapped
     from heliograph.disk.quoting import visible
     from heliograph.files.bag import is_bag
     from heliograph.files.events import holds_events
@@ -142,19 +164,19 @@ def _filtered(
 
 
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
-    """Describe what was written where, a line for each file."""
+    """Describe what was written where in a line, and the errors of each filter."""
     filters = [
         f"{node}/{name} ({_claim(estimate)})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places] + _errors(record)
+    places = " and ".join(str(path) for path in (out, report and report / "report.html") if path is not None)
+    return [f"{places}: {len(record.time)} rows of {', '.join(filters)}", *_errors(record)]
 
 
 def _errors(record: "Record") -> list[str]:
     """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
-    from heliograph.report.errors import errors_of
+    from heliograph.report.outputs import errors_of
 
     lines = []
     for item in errors_of(record):

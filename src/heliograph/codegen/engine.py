@@ -34,6 +34,15 @@ class Choice(NamedTuple):
     why: str
     arrays: tuple[Any, ...] = ()
 
+    @property
+    def explained(self) -> str:
+        """Return "native: ..." with the number of operations, or "xla: ..." with the reason."""
+        if self.code is None:
+            return f"xla: {self.why}"
+        code = self.code.code
+        slow = f", {code.divisions} of them divisions and roots" if code.divisions else ""
+        return f"native: {code.operations} operations{slow}"
+
     def results(self) -> PyTree:
         """Run the code on the arrays."""
         assert self.code is not None
@@ -55,8 +64,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", shown(function))
-    choice = chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments))
-    return f"xla: {choice.why}" if choice.code is None else f"native: {choice.code.code.operations} operations"
+    return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
 
 
 def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:

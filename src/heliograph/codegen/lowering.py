@@ -105,6 +105,12 @@ def keys_of(words: np.ndarray) -> np.ndarray:
     return array_of((Key(*pair) for pair in flat), words.shape[:-1])
 
 
+def scalars(value: np.ndarray) -> list[Node]:
+    """Return the nodes of an array in row-major order, a key as its two words."""
+    flat: list[Any] = value.ravel().tolist()
+    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
+
+
 def type_of(value: Any) -> Type:
     """Return the type of a number, or of an array's numbers."""
     name = np.dtype(value.dtype).name

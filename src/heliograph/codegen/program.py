@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen.graph import Block, Buffer, Graph, Guard, Key, Loop, Node, Store
+from heliograph.codegen.graph import Block, Buffer, Graph, Guard, Loop, Node, Store
 from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
@@ -62,12 +62,6 @@ def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
     with jax.enable_x64(True):
         outputs = lowering.inline(traced, values)
     return Program(lowering.graph, inputs, outputs, tree)
-
-
-def scalars(value: Value) -> list[Node]:
-    """Return the nodes of an array, in row-major order, a key as its two words."""
-    flat: list[Any] = value.ravel().tolist()
-    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
 
 
 def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda item: True) -> set[Any]:
@@ -170,7 +164,7 @@ def _varies(item: Any, result: set[Any]) -> bool:
         owner = item.owner[0]
         if owner is not item:
             return owner in result
-        return any(store.node in result or _is_apart(store.block, result) for store in _stores(item))
+        return any(store.node in result or _is_apart(store.block, result) for store in item.stores)
     # Statements: a loop differs by its condition, a store makes its buffer differ.
     if isinstance(item, Loop):
         return item.length is None and (item.condition in result or any(p in result for p in item.parameters))
@@ -195,10 +189,6 @@ def _varies(item: Any, result: set[Any]) -> bool:
         guard, place = item.value
         return guard in result or guard.values[place] in result
     return any(a in result for a in item.args)
-
-
-def _stores(buffer: Buffer) -> list[Store]:
-    return buffer.stores
 
 
 def _is_apart(block: Block, result: set[Any]) -> bool:

@@ -12,9 +12,8 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, place, traced, type_of
+from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, place, scalars, traced, type_of
 from heliograph.codegen.memory import LARGE, InMemory
-from heliograph.codegen.program import scalars
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree

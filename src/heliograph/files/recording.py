@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.columns import TIME, columns_of
-from heliograph.files.table import write_table
+from heliograph.files.table import TIME, columns_of, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between

@@ -132,7 +132,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses.
         """
         z, u = measured(self, z), given(self, u)
-        return _step_judged(self, state, z, u, step_number(self, k))
+        return step_with_judgement(self, state, z, u, step_number(self, k))[:3]
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -197,14 +197,16 @@ def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) 
 
 
 @compiled
-def _step_judged(
+def step_with_judgement(
     item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
-) -> tuple[PyTree, Estimate, Judgement]:
+) -> tuple[PyTree, Estimate, Judgement, Innovation]:
+    """Step a filter, and return the estimate, the judgement of the measurement, and its innovation."""
     prior = item.predict(state, u, k)
     after, innovation = item.correct(prior, z, k)
     estimate = item.after_step(after, k)
     known = item.estimate(state), item.estimate(prior), estimate
-    return after, estimate, judge(item.claim, (state, prior, after), known, innovation, z, item.of_atoms)
+    judgement = judge(item.claim, (state, prior, after), known, innovation, z, item.of_atoms)
+    return after, estimate, judgement, innovation
 
 
 @compiled

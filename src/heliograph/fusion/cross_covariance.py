@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.linear.plan import Plan
 from heliograph.numerics.linalg import cholesky, rounding, symmetrize
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
 
 SAME = 1e-13  # relative: two matrices that say the same after a few products
@@ -167,6 +169,20 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
         jax.lax.dynamic_update_slice(shared, new, (0, 0, place)),
         moved,
     )
+
+
+def joint_of(shared: Array, local: Array) -> Float[Array, "node n node n"]:
+    """Cov(e_i, e_j) of all pairs, of errors e_i = shared_i s + a_i."""
+    count, n, _ = shared.shape
+    flat = shared.reshape(count * n, -1)
+    apart = np.eye(count)[:, None, :, None] * local[:, :, None]
+    return (flat @ flat.T).reshape(count, n, count, n) + apart
+
+
+def weighted_sources(weights: Array, shared: Array, local: Array) -> tuple[Array, Array]:
+    """Sources (n, sources) of a weighted sum of the errors, and the covariance (n, n) of its independent part."""
+    jnp = library(weights, shared, local)
+    return jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, local, weights)
 
 
 def observation_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:

@@ -171,7 +171,7 @@ class DiagonalWeights(AbstractWeights):
             return super().neighbour_weights(believed)
         chosen = component_weights(believed.joint, believed.present)
         identity = jnp.eye(chosen.shape[1])
-        return Weights(identity, chosen[:, :, None] * identity, weighted_by_component(chosen, believed.joint))
+        return Weights(identity, chosen, weighted_by_component(chosen, believed.joint))
 
 
 class ScalarWeights(AbstractWeights):

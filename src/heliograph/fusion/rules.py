@@ -127,7 +127,25 @@ def _combine_all(
     return combine(jnp.asarray(means), jnp.asarray(covariances))
 
 
-class CovarianceIntersection(AbstractFusion):
+class AbstractIntersection(AbstractFusion):
+    """Covariance intersection, P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, with any weights w."""
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Lower the weakest claim to "upper" at most."""
+        return _of_covariances(claims, "upper")
+
+    def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
+        """Weights on the simplex of estimates with these P_i and P_i^-1."""
+        raise NotImplementedError
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Find the weights and intersect."""
+        information = inverses(covariances)
+        mean, covariance = intersect(means, information, self.weights_of(covariances, information))
+        return mean, without_known(covariance, covariances)
+
+
+class CovarianceIntersection(AbstractIntersection):
     """Covariance intersection with the weights that minimise the trace.
 
     P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, w on the simplex; tr P is convex in w. An upper bound for
@@ -137,41 +155,31 @@ class CovarianceIntersection(AbstractFusion):
     Source: Julier and Uhlmann (1997); cubature fusion under amplify-and-forward relays, equations (8) and (34).
     """
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
-        return _of_covariances(claims, "upper")
-
-    def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Find the weights and intersect."""
-        information = inverses(covariances)
-        return _intersection(means, covariances, information, trace_optimal_weights(information))
+    def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
+        """Weights of least trace."""
+        return trace_optimal_weights(information)
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect with shares that are nearly those of least trace: a few improvements of `TraceIntersection`."""
         return intersection_weights(believed, trace_shares(believed, POWER, IMPROVEMENTS))
 
 
-class EqualIntersection(AbstractFusion):
+class EqualIntersection(AbstractIntersection):
     """Covariance intersection with equal weights: nothing is chosen, so data-dependent covariances cannot mislead.
 
     Source: cubature fusion under amplify-and-forward relays, equation (8) with w_i = 1 / M.
     """
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
-        return _of_covariances(claims, "upper")
-
-    def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Intersect with equal weights."""
-        count = means.shape[0]
-        return _intersection(means, covariances, inverses(covariances), jnp.full(count, 1 / count))
+    def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
+        """Equal weights."""
+        return jnp.full(len(information), 1 / len(information))
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect with equal shares of what arrived."""
         return intersection_weights(believed, equal_shares(believed))
 
 
-class FixedIntersection(AbstractFusion):
+class FixedIntersection(AbstractIntersection):
     """Covariance intersection with fixed weights.
 
     Args:
@@ -192,13 +200,9 @@ class FixedIntersection(AbstractFusion):
         """Raise ValueError unless there are as many weights as estimates."""
         array("fusion weights", self.weights, (count,))
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
-        return _of_covariances(claims, "upper")
-
-    def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Intersect with the given weights."""
-        return _intersection(means, covariances, inverses(covariances), jnp.asarray(self.weights))
+    def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
+        """Return the given weights."""
+        return jnp.asarray(self.weights)
 
 
 class WeightedFusion(AbstractFusion):
@@ -256,11 +260,6 @@ class InverseCovarianceIntersection(AbstractFusion):
         return mean, covariance
 
 
-def _intersection(means: Means, covariances: Covariances, information: Covariances, weights: jax.Array) -> Fused:
-    mean, covariance = intersect(means, information, weights)
-    return mean, without_known(covariance, covariances)
-
-
 def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
     """Weakest claim, for rules whose weights come from covariances."""
     if "none" in claims:
@@ -295,7 +294,8 @@ class Fusion(Module):
             are forwarded with the name of their node, so that each counts once.
         alpha: events. A node sends its estimate only if (xhat - xs)' P^-1 (xhat - xs) > alpha n, xs that which it sent
             last, predicted (at first the plant's mean); its measurement always. Neighbours intersect by the bound
-            (1 + sqrt(alpha n))^2 P of xs, sent or not. For intersections, one round, no link; None by default.
+            (1 + sqrt(alpha n))^2 P of xs, sent or not. For intersections, one round; None by default. Where messages
+            get lost, xs is what each neighbour received last, predicted: the sender learns which arrived.
 
     Raises:
         ValueError: a rule that is none, neighbours that are none; links, rounds or events without neighbours.

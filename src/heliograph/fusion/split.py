@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
 from heliograph.fusion.weights import matrix_weights, weighted
-from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -15,7 +14,7 @@ ROUNDS = 30  # of weights for shares and shares for weights, each of which lower
 LEAST = 1e-12  # share of an estimate that is hardly used
 
 
-class SplitIntersection(AbstractFusion):
+class SplitIntersection(AbstractIntersection):
     """Fuse errors e_i = a_i + b_i, a and b uncorrelated, the a_i jointly known, of the b_i nothing but each covariance.
 
     For every w on the simplex P(w) = P^a + blockdiag(P^b_i / w_i) bounds the joint covariance, whatever the correlation
@@ -60,12 +59,6 @@ class SplitIntersection(AbstractFusion):
         """Raise ValueError unless there are as many known parts as estimates."""
         if len(self.known) != count:
             raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
-
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
-        if "none" in claims:
-            raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
-        return weakest([*claims, "upper"])
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Alternate weights for shares and shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""

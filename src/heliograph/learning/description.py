@@ -1,19 +1,171 @@
-"""Networks with free numbers: a function that returns one, built again with other numbers where some are free."""
+"""Networks with free numbers: a function that returns one, built again with others in the places of its marks."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
+from typing import Any, Literal, Protocol, get_args
 
 import jax
 import numpy as np
+from typing_extensions import TypeAliasType
 
-from heliograph.learning.free_marks import Asking, Build, Given, reading
-from heliograph.learning.parameters import Parameters, plain_number
-from heliograph.numerics.check import fail, function, instance, shown_error
+from heliograph.learning.likelihood.transforms import to_line
+from heliograph.learning.parameters import Parameter, Parameters, plain_number
+from heliograph.numerics.check import (
+    COVARIANCE,
+    POSITIVE,
+    PROBABILITY,
+    REAL,
+    SIMPLEX,
+    Domain,
+    array,
+    fail,
+    function,
+    instance,
+    marked,
+    rank,
+    shown,
+    shown_error,
+)
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
+
+Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
+Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
+
+DOMAINS: dict[Kind, Domain] = {
+    "real": REAL,
+    "positive": POSITIVE,
+    "probability": PROBABILITY,
+    "simplex": SIMPLEX,
+    "covariance": COVARIANCE,
+}
+
+
+def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) -> Any:
+    """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
+
+    `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
+    that `hg.fit` calls. One name in several places is one number. Its place decides its domain: a variance and a scale
+    stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain, an
+    entry of a matrix, a number in a user's function may be any, unless `kind` says otherwise. Anywhere else than in a
+    fit it is its start.
+
+    Args:
+        start: value from which the search begins, () or of any shape; of kind "simplex" it sums to 1 over the last
+            axis.
+        name: name in the table of results; by default the number is called after its place.
+        kind: "real", "positive", "probability", "simplex" or "covariance"; decided by its place unless given.
+
+    Raises:
+        ValueError: a start that is no number, or an unknown kind.
+    """
+    if kind is not None and not (isinstance(kind, str) and kind in get_args(Kind)):
+        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", shown(kind))
+    if name is not None and (not isinstance(name, str) or not name):
+        raise fail("name of a free number", "a text", shown(name))
+    what = "free number" if name is None else name
+    value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
+    reader = _reader.get()
+    return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
+
+
+class _Reader(Protocol):
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object: ...
+
+
+# What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
+_reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", default=None)
+
+
+@contextmanager
+def reading(reader: _Reader) -> Iterator[None]:
+    """Have `free` answer as this reader does, inside the block."""
+    token = _reader.set(reader)
+    try:
+        yield
+    finally:
+        _reader.reset(token)
+
+
+class _Mark:
+    """Free number while it is being collected."""
+
+    def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
+        self.start, self.given, self.place = start, name, ""
+        self.domain = None if kind is None else DOMAINS[kind]
+        self.explicit = kind is not None
+
+    def report(self, name: str, domain: Domain) -> None:
+        """Narrow the domain to what a check of the number's place requires."""
+        self.place = self.place or name
+        if self.explicit:
+            return
+        known = REAL if self.domain is None else self.domain
+        if known.kind == domain.kind == "interval":
+            domain = Domain(low=max(known.low, domain.low), high=min(known.high, domain.high))
+        elif domain == REAL:
+            domain = known
+        self.domain = domain
+
+
+class Asking:
+    """Collector of what is free."""
+
+    def __init__(self) -> None:
+        self.marks: list[_Mark] = []
+
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return the start, marked so that checks of its place report the domain."""
+        for mark in self.marks:
+            if name is not None and mark.given == name:
+                if not np.array_equal(mark.start, start):
+                    raise fail(
+                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
+                    )
+                return marked(start, mark.report)
+        self.marks.append(_Mark(start, name, kind))
+        return marked(start, self.marks[-1].report)
+
+    def parameters(self) -> Parameters:
+        """Collect all marks as parameters; one without a name is called after its place."""
+        taken = {mark.given for mark in self.marks if mark.given is not None}
+        results = []
+        for mark in self.marks:
+            name = mark.given or _new(mark.place or "free number", taken)
+            taken.add(name)
+            domain = REAL if mark.domain is None else mark.domain
+            item = Parameter(name, mark.start, domain)
+            to_line(name, domain, mark.start)
+            results.append(item)
+        return Parameters(tuple(results))
+
+
+class Given:
+    """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
+
+    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
+        self.values = values
+        self.unnamed = iter([item.name for item, single in zip(parameters.every, named, strict=True) if not single])
+
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return the value."""
+        key = next(self.unnamed, "") if name is None else name
+        if key not in self.values:
+            raise fail(
+                "network", "the same free numbers each time it is built", "another one" if name is None else name
+            )
+        return self.values[key]
+
+
+def _new(name: str, taken: set[str]) -> str:
+    if name not in taken:
+        return name
+    return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)
 
 
 @readable

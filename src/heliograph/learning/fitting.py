@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.description import Description, describe
-from heliograph.learning.free_marks import Build
+from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.likelihood.maximise import Maximum
-from heliograph.learning.likelihood.objective import Form, objectives
-from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.objective import Form, gathered, objectives
 from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
@@ -27,6 +25,7 @@ INVISIBLE = 0.01  # information of a logarithm below which its number may as wel
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
+Rows = TypeAliasType("Rows", ArrayLike | Sequence[ArrayLike])  # of one recording, or a list of one for each
 
 
 @readable
@@ -124,10 +123,11 @@ class Fit:
 def fit(
     network: Build,
     recording: object,
-    inputs: ArrayLike | Sequence[ArrayLike] | None = None,
+    inputs: Rows | None = None,
     starts: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
+    truth: Rows | bool = False,
 ) -> Fit | SenderFit:
     """Learn what is free in a network from one recording or several.
 
@@ -138,6 +138,10 @@ def fit(
     included; delta and losses are free numbers like others. A heartbeat is a whole number: fit with each that may be,
     and compare `log_likelihood`. The result is a `SenderFit`.
 
+    With `truth` what is maximised is the log density of the true states under the estimates of the network's one
+    filter, its rule and its claim included: for errors that are correlated from row to row, of which the likelihood of
+    the measurements takes the small difference between rows for the whole.
+
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
@@ -146,19 +150,24 @@ def fit(
         starts: number of starts: the given one, and others drawn around it.
         seed: seed of the starts that are drawn.
         progress: called with a line of text at each step.
+        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True
+            takes those that the recordings hold.
 
     Raises:
         ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit
-            it, are too short or constant; a free number on which nothing depends; a start that is impossible.
+            it, are too short or constant; a free number on which nothing depends; a start that is impossible; truth
+            and not one filter, of all that arrives.
     Source: Schweppe (1965) for the likelihood; Huber (1967) for intervals where it is not the true one.
     """
     check_count("starts", starts)
     description = describe(network)
     if decides(description.start):
+        if truth is not False:
+            raise fail("truth", "none behind a sender that decides when to send", "one")
         return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
-    data = gathered(description.start, recording, inputs, description.parameters.size)
+    data = gathered(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
-    surfaces = [Surface(objective, data) for objective in objectives(description)]
+    surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
     say: Progress = progress or (lambda line: None)
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
     stopped, ends, solutions = False, np.zeros(0), []

@@ -8,8 +8,8 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.learning.intervals import mean_and_error
 from heliograph.learning.likelihood.predictive_density import Predictive, predictive
-from heliograph.learning.long_run import mean_and_error
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError, fail, instance
 from heliograph.numerics.module import readable

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.learning.description import describe
-from heliograph.learning.free_marks import Build
+from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import quantile
 from heliograph.learning.likelihood.objective import Data, Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface

@@ -9,8 +9,8 @@ from scipy.stats import norm
 
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
+from heliograph.learning.intervals import long_run_deviation
 from heliograph.learning.likelihood.predictive_density import NODES, Parts, expected_signals, of_signals
-from heliograph.learning.long_run import long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import readable, same

@@ -12,7 +12,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
-from heliograph.live.history import History, NetworkStep, at_step, interval
+from heliograph.live.history import History
+from heliograph.live.row_step import NetworkStep
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
@@ -35,20 +36,19 @@ class Sweep(Module):
     network_step: NetworkStep
     fusions: tuple[Fused, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
-    structure: jax.tree_util.PyTreeDef = eqx.field(static=True)  # of the outputs after a row
 
     def step(
         self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, SmootherStep]:
         """Step all filters into a row, without implausible measurements; return also their smoother steps."""
-        local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
+        local, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = local, {name: central[name] for name in self.network_step.filters.central}
         after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
         return after, ({kind: result["smoother_steps"][kind] for kind in self.kinds}, result["central_steps"])
 
-    def start(self, history: History, slot: jax.Array) -> PyTree:
+    def start(self, history: History, row: jax.Array) -> PyTree:
         """Return the filters' states after a row of the history."""
-        local, central, *_ = history.known(slot)
+        local, central, *_ = history.known(row)
         return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}
 
     def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
@@ -72,37 +72,37 @@ def _back(step: AbstractSmootherStep, later: PyTree, before: AbstractSmootherSte
     return step.back(later, before.mean, before.covariance)
 
 
-Place: TypeAlias = "tuple[jax.Array, jax.Array]"  # where a row stands in the order, and a step at it or before it
-Into: TypeAlias = "Callable[[Sweep, History, jax.Array, Place], SmootherStep]"
+Place: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
+Into: TypeAlias = "Callable[[Sweep, History, Place], SmootherStep]"
 
 
 @lru_cache
 def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
-    """Compile (numbers, history, order, (begin, stop)) -> estimates after row order[begin], given the rows after it.
+    """Compile (numbers, history, (begin, stop)) -> estimates after row `begin`, given the rows after it, up to `stop`.
 
-    Rows are order[begin:stop], begin > 0. The smoother's terms of a step are computed again from the state before it,
-    and so are the steps between rows where time counts steps.
+    The smoother's terms of a step are computed again from the state before it, and so are the steps between rows where
+    time counts steps; begin > 0.
     """
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
-    def run(numbers: list[jax.Array], history: History, order: jax.Array, place: jax.Array) -> PyTree:
+    def run(numbers: list[jax.Array], history: History, place: jax.Array) -> PyTree:
         item: Sweep = static.filled(numbers)
         begin, stop = place
-        last = stop - 1, history.step[order[stop - 1]]
-        count = stop - 1 - begin if dt is not None else last[1] - history.step[order[begin]]
+        last = stop - 1, history.step[stop - 1]
+        count = stop - 1 - begin if dt is not None else last[1] - history.step[begin]
         # Shapes of a smoother step, without computing one.
         blank = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, history, order, last))
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, history, last))
         )
 
         # One step back: x_k|N from x_(k+1)|N and the smoother step into row k + 1; at the last row x_N|N.
         def single(i: jax.Array, carry: tuple[Place, SmootherStep, PyTree]) -> tuple[Place, SmootherStep, PyTree]:
             now, steps, later = carry
-            before = into(item, history, order, now)
+            before = into(item, history, now)
             passed, ends = _over_filters(_back, steps, later, before), _over_filters(lambda step: step.end(), before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
-            return earlier(history, order, now), before, later
+            return earlier(history, now), before, later
 
         begun = last, blank, _over_filters(lambda step: step.end(), blank)
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
@@ -112,38 +112,38 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
 
 
 def _into_row(dt: int) -> Into:
-    def into(item: Sweep, history: History, order: jax.Array, place: Place) -> SmootherStep:
-        before, now = order[place[0] - 1], order[place[0]]
-        u = interval(history, before, now, dt)
-        return item.step(history, now, item.start(history, before), history.parts(now)[0], u, history.step[now])[1]
+    def into(item: Sweep, history: History, place: Place) -> SmootherStep:
+        row, _ = place
+        state, received = item.start(history, row - 1), history.parts(row)[0]
+        return item.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
 
     return into
 
 
-def _earlier_row(history: History, order: jax.Array, place: Place) -> Place:
-    return place[0] - 1, history.step[order[place[0] - 1]]
+def _earlier_row(history: History, place: Place) -> Place:
+    return place[0] - 1, history.step[place[0] - 1]
 
 
-def _into_step(item: Sweep, history: History, order: jax.Array, place: Place) -> SmootherStep:
-    """Compute the smoother step at step k, by way of the steps without measurements since the previous row."""
-    before, now, k = order[place[0] - 1], order[place[0]], place[1]
+def _into_step(item: Sweep, history: History, place: Place) -> SmootherStep:
+    """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
+    row, k = place
 
     def single(j: jax.Array, state: PyTree) -> PyTree:
-        return item.step(history, now, state, *at_step(history, before, now, j), j)[0]
+        return item.step(history, row, state, *history.at_step(row, j), j)[0]
 
-    state = jax.lax.fori_loop(history.step[before] + 1, k, single, item.start(history, before))
-    return item.step(history, now, state, *at_step(history, before, now, k), k)[1]
+    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, single, item.start(history, row - 1))
+    return item.step(history, row, state, *history.at_step(row, k), k)[1]
 
 
-def _earlier_step(history: History, order: jax.Array, place: Place) -> Place:
+def _earlier_step(history: History, place: Place) -> Place:
     row, k = place
-    return jnp.where(k - 1 == history.step[order[row - 1]], row - 1, row), k - 1
+    return jnp.where(k - 1 == history.step[row - 1], row - 1, row), k - 1
 
 
 class Sweeper:
     """The smoothing program of a network, with its numbers and the names of its results."""
 
-    def __init__(self, network: Network, dt: int | None, structure: jax.tree_util.PyTreeDef):
+    def __init__(self, network: Network, dt: int | None):
         self.network = network
         kinds = tuple(k for k, kind in enumerate(network.kinds) if _can_smooth(_of(network, k, kind.filters[0])))
         items = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
@@ -155,17 +155,17 @@ class Sweeper:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(item for item in AllFilters(network).fusions if self._fuses(item, kinds))
         with jax.enable_x64(True):
-            self.item = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds, structure)
+            self.item = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
             self._numbers, static = cast(self.item)
         self._run = sweep_back(static, dt)
 
     def _fuses(self, item: Fused, kinds: tuple[int, ...]) -> bool:
         return item.quantizers is None and all(kind in kinds for source in item.sources for kind, _ in source)
 
-    def estimates(self, history: History, order: np.ndarray, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
+    def estimates(self, history: History, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Return estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
-            local, fused = self._run(self._numbers, history, order, np.array([begin, stop], dtype=np.int32))
+            local, fused = self._run(self._numbers, history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
         for k, outputs in local.items():
             for f, name in enumerate(self.network.kinds[k].filters):

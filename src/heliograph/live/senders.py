@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractTrigger
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import outcomes
 from heliograph.random_affine.modes import joint_modes
 from heliograph.simulation.node import Node
@@ -36,15 +37,45 @@ class SenderStatus(NamedTuple):
         return self.missed > 0 and self.chance < DEAD
 
 
-def sender_status(node: Node, last: int | None, final: int, now: int) -> SenderStatus:
+class LossChain(NamedTuple):
+    """Losses of a link by mode: their probability (M,), the modes' transition (M, M) and first law (M,)."""
+
+    loss: np.ndarray
+    transition: np.ndarray
+    initial: np.ndarray
+
+    @staticmethod
+    def of_node(node: Node) -> "LossChain":
+        """Losses of the link of a node."""
+        modes = joint_modes(first(node.channel))
+        loss = [sum(float(o.probability) for o in outcomes(m) if not o.arrived.any()) for m in modes.maps]
+        return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
+
+    @staticmethod
+    def of_filter(item: EventFilter | StochasticEventFilter) -> "LossChain":
+        """Losses of the link of an event filter."""
+        channel = first(item.channel)
+        nothing = ~np.any(np.asarray(channel.present), axis=1)
+        loss = np.asarray(channel.chance) @ nothing
+        return LossChain(loss, np.asarray(channel.transition), np.asarray(item.initial))
+
+    def in_a_row(self, apart: int, count: int) -> float:
+        """Return the probability that `count` transmissions, so many steps apart, are all lost."""
+        if not count:
+            return 1.0
+        moved = np.linalg.matrix_power(self.transition, apart)
+        law = self.initial * self.loss
+        for _ in range(count - 1):
+            law = (law @ moved) * self.loss
+        return float(law.sum())
+
+
+def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int) -> SenderStatus:
     """The status where the newest value is of step `last`, the newest final step `final` and the present one `now`."""
     begun = -1 if last is None else last
     silent, provisional = max(final - begun, 0), max(now - max(final, begun), 0)
-    missed = 0
-    if node.trigger is not None:
-        missed = missed_heartbeats(node.trigger, last, silent, final)
-    chance = lost_in_a_row(first(node.channel), node.trigger.heartbeat or 1, missed) if node.trigger else 1.0
-    return SenderStatus(last, silent, provisional, missed, chance)
+    missed = missed_heartbeats(trigger, last, silent, final)
+    return SenderStatus(last, silent, provisional, missed, losses.in_a_row(trigger.heartbeat or 1, missed))
 
 
 def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
@@ -61,16 +92,3 @@ def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, f
     if trigger.heartbeat is None:
         return first_due
     return first_due + (silent - first_due) // trigger.heartbeat
-
-
-def lost_in_a_row(channel: AbstractRandomAffine, apart: int, count: int) -> float:
-    """The probability that `count` transmissions, so many steps apart, are all lost."""
-    if not count:
-        return 1.0
-    modes = joint_modes(channel)
-    loss = np.array([sum(float(o.probability) for o in outcomes(m) if not o.arrived.any()) for m in modes.maps])
-    moved = np.linalg.matrix_power(np.asarray(modes.transition), apart)
-    law = np.asarray(modes.initial) * loss
-    for _ in range(count - 1):
-        law = (law @ moved) * loss
-    return float(law.sum())

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.filters.event.gaussian_sum import EventFilter
+from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import INPUT, in_words, why_inputs
-from heliograph.live.identity import Identity, check_same, short_name, versions
-from heliograph.live.snapshot import packed, unpacked
+from heliograph.live.senders import LossChain, SenderStatus, sender_status
+from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
@@ -45,7 +47,7 @@ class Stream:
         self.filter = filter
         self.limits = limits_of(filter.received, limits, invalid)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
-        self.steps = 0
+        self.steps, self._last = 0, -1
         self._placed = _place(filter)
         self._stepper = self._placed.stepper()
 
@@ -78,6 +80,8 @@ class Stream:
         if not stepper.step(z, u, k):
             self._refuse(z, u)
         self.steps = k + 1
+        if placed.values and not np.isnan(z[: placed.values]).all():
+            self._last = k
         if outside is not None:
             self.dropped += outside
         result: Estimate = placed.estimate.unflatten(stepper.estimate)
@@ -101,10 +105,21 @@ class Stream:
         stepper.step(z, u, self.steps)  # anew, if inputs were tried without
         stepper.accept()
 
+    def sender(self) -> SenderStatus:
+        """Return the status of a sender that decides when to send: what its silence means by now.
+
+        Raises:
+            ValueError: a filter that is none of `event_filter`.
+        """
+        if not isinstance(self.filter, EventFilter | StochasticEventFilter):
+            raise fail("filter of a stream", "one of event_filter, whose sender decides", type(self.filter).__name__)
+        last, now = None if self._last < 0 else self._last, self.steps - 1
+        return sender_status(self.filter.trigger, LossChain.of_filter(self.filter), last, now, now)
+
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
-        head = {"steps": self.steps, "dropped": self.dropped.tolist(), "of": self._placed.identity}
+        head = {"steps": self.steps, "dropped": self.dropped.tolist(), "last": self._last, "of": self._placed.identity}
         return packed(head, leaves)
 
     @classmethod
@@ -115,6 +130,7 @@ class Stream:
         new, (head, arrays) = cls(filter, limits, invalid), unpacked(data)
         check_same("snapshot", new._placed.identity, head.get("of", {}))
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
+        new._last = int(head.get("last", -1))
         new._stepper.put([arrays[f"state.{i}"] for i in range(len(new._stepper.state))])
         return new
 
@@ -148,6 +164,10 @@ class _Placed:
     def __init__(self, filter: AbstractFilter):
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
+        # Numbers of what a sender sent, if it decides when to send; losses that are known follow them.
+        self.values = 0
+        if isinstance(filter, EventFilter | StochasticEventFilter):
+            self.values = filter.received - filter.trigger.side_information(filter.outputs)
         with jax.enable_x64(True):
             self.numbers, self._static = cast(filter)
             self._start: PyTree = jax.tree.map(jnp.asarray, filter.init())

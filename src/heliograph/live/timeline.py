@@ -2,30 +2,45 @@
 
 import warnings
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, VERDICTS, Known, Verdict, moment, numbers, whole
-from heliograph.live.finals import Finals
-from heliograph.live.history import READ, History, copied, read
-from heliograph.live.identity import check_same
 from heliograph.live.player import player
+from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
-from heliograph.live.senders import SenderStatus, sender_status
-from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
+from heliograph.live.senders import LossChain, SenderStatus, sender_status
+from heliograph.live.snapshot import check_same, packed, row_arrays, rows_from, unpacked
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
-from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.results.record import Record
+
+
+class Finals:
+    """Rows of final outputs, of `size` numbers, in order of time; beyond `most` rows the oldest parts are dropped."""
+
+    def __init__(self, most: int, size: int):
+        self.most, self.size, self._parts = most, size, list[tuple[np.ndarray, np.ndarray]]()
+
+    def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
+        """Append the outputs of some rows."""
+        self._parts.append((time, rows))
+        while sum(len(part) for part, _ in self._parts[1:]) >= self.most:
+            del self._parts[0]
+
+    def take(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
+        """Remove and return all times and rows."""
+        times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
+        self._parts = []
+        return np.concatenate(times), np.concatenate(rows)
 
 
 @readable
@@ -86,36 +101,38 @@ class Timeline:
         self.counts = {name: dict.fromkeys(VERDICTS, 0) for name in self._sizes}
         self.dropped = dict.fromkeys(network.names, 0)
         self.forced = 0
-        # Slots on the device, and the prior as the base.
-        slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
-        begun = self.now if self._dt is not None else -1.0
-        self._history, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
         # Columns of each node in a row.
         ends = np.cumsum([size for _, size in self._sizes.values()])
         places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
         self._size = int(ends[-1])
+        # The prior as the base, and a slot to look ahead in.
+        self._pool = Pool(self._player, alone=True)
+        begun = self.now if self._dt is not None else -1.0
+        base, self._spare = HeldRow((begun, BEFORE, 0), self._pool.take(), self._size), self._pool.take()
+        self._pool.start(base.slot, base.key[0])
         joint = self._dt is None or network.common is not None
-        self._rows = Rows(HeldRow((begun, BEFORE, 0), 0, self._size), joint, places, self.capacity)
-        self._order, self._free = np.zeros(slots, dtype=np.int32), list(range(slots - 2, 0, -1))
-        self._unread, self._left = list[HeldRow](), list[int]()  # final rows, and slots to free when these were read
-        self._latest: list[np.ndarray] | None = None
+        self._rows = Rows(base, joint, places, self.capacity)
+        self._finals = Finals(2 * self.capacity, self._player.step_rows.outputs.size)
+        self._latest: np.ndarray | None = None  # outputs after the newest row
         self._last = np.full(len(network.names), np.nan)  # time of each node's newest final value
 
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
-        stored = {name: value for name, value in vars(self).items() if name != "_player"}
-        return stored | {"_history": to_numpy(self._history)}
+        head, arrays = self._state()
+        return {"network": self.network, "saved": packed(head, arrays)}
 
-    def __setstate__(self, stored: dict[str, object]) -> None:
-        vars(self).update(stored)
-        self._player = player(self.network)
-        with jax.enable_x64(True):
-            self._history = jax.tree.map(jnp.asarray, self._history)
+    def __setstate__(self, stored: dict[str, Any]) -> None:
+        vars(self).update(vars(self._resumed(stored["network"], *unpacked(stored["saved"]))))
+
+    @property
+    def engine(self) -> str:
+        """Return which engine steps the filters, "native: ..." or "xla: ...", and why."""
+        return self._player.step_rows.engine
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
 
-        It costs one call of one compiled program, over the steps from the event's on.
+        It costs a step from the event's row on into each later one.
 
         Raises:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
@@ -163,28 +180,36 @@ class Timeline:
         Raises:
             ValueError: no such node.
         """
-        deciding = {n: v for n, v in self.network.nodes.items() if isinstance(v, Node) and v.trigger is not None}
+        nodes = {name: node for name, node in self.network.nodes.items() if isinstance(node, Node)}
+        deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
         if not deciding:
             raise fail("senders", "a node with a trigger", list(self.network.names))
         final, now = int(np.ceil(self.now - self.window)) - 1, int(np.floor(min(self.now, self._end())))
         results = {}
-        for name, node in deciding.items():
+        for name, (trigger, node) in deciding.items():
             place = self._sizes[name][0]
             times = [row.key[0] for row in self._rows.held if any(at == place for at, _, _ in row.events)]
             last = max([*times, self._last[place]], default=np.nan)
-            results[name] = sender_status(node, None if np.isnan(last) else int(last), final, now)
+            results[name] = sender_status(
+                trigger, LossChain.of_node(node), None if np.isnan(last) else int(last), final, now
+            )
         return results
 
     def _end(self) -> float:
         """Return the last step that the network covers."""
         return np.inf if self._horizon is None else self._horizon - 1
 
-    def _look(self, time: float, place: int) -> list[np.ndarray]:
+    def _look(self, time: float, place: int) -> np.ndarray:
         """Predict to a time after the row before `place`, in a slot that no row has; return the outputs."""
-        stored, self._order[place] = self._order[place], len(self._order) - 1
-        outputs = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
-        self._order[place] = stored
-        return outputs
+        self._pool.table[self._spare, self._pool.numbers] = HeldRow(
+            (float(time), 0, 0), self._spare, self._size
+        ).numbers
+        self._pool.reach(self._rows.held[place - 1].slot, self._spare)
+        return self._outputs(self._spare)
+
+    def _outputs(self, slots: int | list[int]) -> np.ndarray:
+        """Return the outputs after the row in a slot, or after several."""
+        return self._pool.table[slots, self._pool.outputs].copy()
 
     def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
         """Return smoothed estimates at `now` - `lag` given all events held, by node and filter."""
@@ -193,14 +218,13 @@ class Timeline:
         time = self.now - lag if self._dt is not None else np.ceil(min(self.now, self._end()) - lag)
         if time <= self._rows.keys[0][0] if self._dt is None else time < self._rows.keys[0][0]:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
-        place = self._rows.after(time)
-        order, stop = self._order, len(self._rows.held)
+        place, slots = self._rows.after(time), [row.slot for row in self._rows.held]
         if self._dt is not None or self._rows.keys[place - 1][0] < time:
             self._look(time, place)
-            order, stop = np.insert(order, place, len(order) - 1)[:-1], stop + 1
+            slots.insert(place, self._spare)
         else:
             place -= 1
-        return self._player.sweeper.estimates(self._history, order, place, stop)
+        return self._player.sweeper.estimates(self._pool.history(slots), place, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
@@ -208,50 +232,50 @@ class Timeline:
         They are the filtered estimates after the row, in order of time. Without calls, the last 2 `capacity` of them
         are kept.
         """
-        self._collect()
-        time, outputs = self._finals.take(self._history.outputs)
+        time, outputs = self._finals.take()
         return Record(time, self.network.states, None, {}, self._named(outputs))
 
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
-        self._collect()
-        time, outputs = self._finals.take(self._history.outputs)
+        head, arrays = self._state()
+        return packed(head | {"of": self._player.identity}, arrays)
+
+    def _state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+        """Return the whole state: numbers and counts, and arrays."""
+        time, outputs = self._finals.take()
         self._finals.add(time, outputs)
-        slots = [row.slot for row in self._rows.held]
-        held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._history))}
-        final = {f"final.{i}": leaf for i, leaf in enumerate(outputs)}
-        head = {"now": self.now, "forced": self.forced, "counts": self.counts, "of": self._player.identity}
-        head |= {"dropped": self.dropped}
-        head |= {"options": [self.window, self.ahead, self.capacity]}
-        held |= {"senders.last": self._last}
-        return packed(head, {**row_arrays(self._rows.held), **held, **final, "final.time": time})
+        head = {"now": self.now, "forced": self.forced, "counts": self.counts, "dropped": self.dropped}
+        table = self._pool.table[[row.slot for row in self._rows.held]]
+        arrays = {"table": table, "senders.last": self._last, "final.time": time, "final": outputs}
+        options = {"options": [self.window, self.ahead, self.capacity]}
+        return head | options, row_arrays(self._rows.held) | arrays
 
     @classmethod
     def restore(cls, network: Network, data: bytes) -> "Timeline":
         """Restore a saved timeline of the same network."""
         head, arrays = unpacked(data)
         check_same("snapshot", player(network).identity, head.get("of", {}))
+        return cls._resumed(network, head, arrays)
+
+    @classmethod
+    def _resumed(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
+        """Make a timeline from a saved state."""
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # the warning was given when the timeline was made
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
-        leaves, structure = jax.tree.flatten(new._history)
-        saved = [arrays[f"tape.{i}"] for i in range(len(leaves))]
-        new._resume(head, arrays, jax.tree.unflatten(structure, saved))
+        new.now, new.forced, new.counts, new.dropped = (head[name] for name in ("now", "forced", "counts", "dropped"))
+        new._last = np.array(arrays["senders.last"])
+        # The rows take the first slots of a new table.
+        new._pool, saved = Pool(new._player, alone=True), arrays["table"]
+        slots = [new._pool.take() for _ in range(len(saved))]
+        new._spare = new._pool.take()
+        new._pool.table[slots] = saved
+        new._rows.hold(rows_from(arrays, saved[:, new._pool.numbers], dict(new._sizes.values())))
+        new._finals.add(arrays["final.time"], arrays["final"])
+        if new._rows.keys[-1][1] != BEFORE:
+            new._latest = new._outputs(slots[-1])
         return new
-
-    def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: History) -> None:
-        """Set the state from a saved one."""
-        self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
-        self.dropped = head["dropped"]
-        self._last = np.array(arrays["senders.last"])
-        slots, count = len(self._order), len(arrays["row.time"])
-        self._history = self._player.filled(slots, saved)
-        self._rows.hold(rows_from(arrays, np.asarray(saved.rows), dict(self._sizes.values())))
-        self._order[:count], self._free = np.arange(count), list(range(slots - 2, count - 1, -1))
-        self._finals.add(arrays["final.time"], [arrays[f"final.{i}"] for i in range(len(saved.outputs))])
-        begun = self._rows.keys[-1][1] != BEFORE
-        self._latest = [np.asarray(leaf)[-1] for leaf in saved.outputs] if begun else None
 
     def _known(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
         """Convert an event to numbers."""
@@ -269,59 +293,44 @@ class Timeline:
     def _used(self, event: Known) -> bool:
         """Insert the event and replay from its row; if it is implausible, restore everything and return False."""
         place, row = self._rows.find(event)
-        # A new row takes a free slot; the order of slots makes room for it.
         before = None if row is None else (row.numbers.copy(), dict(row.events))
         if row is None:
-            if not self._free:
-                self._collect()
-            row = HeldRow(self._rows.key(event), self._free.pop(), self._size)
-            self._order[place + 1 : len(self._rows.held) + 1] = self._order[place : len(self._rows.held)].copy()
-            self._order[place] = row.slot
+            row = HeldRow(self._rows.key(event), self._pool.take(), self._size)
             self._rows.insert(place, row)
         self._rows.fill(row, event)
         # Replay from the row on, and judge the event by the outputs.
         latest = self._replayed(row, place, len(self._rows.held))
-        if not self._refuses(event, row, place, latest):
+        if not self._refuses(event, row, place):
             self._latest = latest
             return True
         # Refused: restore the row or remove it, and replay what follows.
         if before is None:
             self._rows.remove(place)
-            self._order[place : len(self._rows.held)] = self._order[place + 1 : len(self._rows.held) + 1].copy()
-            self._free.append(row.slot)
+            self._pool.give([row.slot])
         else:
             row.numbers[:], row.events = before
         if place < len(self._rows.held):
             self._replayed(self._rows.held[place], place, len(self._rows.held))
         return False
 
-    def _refuses(self, event: Known, row: HeldRow, place: int, latest: list[np.ndarray]) -> bool:
+    def _refuses(self, event: Known, row: HeldRow, place: int) -> bool:
         """Return whether a replayed event is implausible; inputs are also judged over one unit of time after them."""
-        if place < len(self._rows.held) - 1:
-            latest = self._published_at(row.slot)
         name = INPUTS if event.place < 0 else self.network.names[event.place]
-        why = self._player.why(latest, name)
+        why = self._player.why(self._outputs(row.slot), name)
         if why is None and name == INPUTS and self._dt is not None:
             why = self._player.why(self._look(row.key[0] + 1.0, place + 1), name)
         return why is not None
 
-    def _published_at(self, slot: int) -> list[np.ndarray]:
-        """Read the outputs after the row in a slot."""
-        slots = np.full(READ, slot, dtype=np.int32)
-        with jax.enable_x64(True):
-            return [np.asarray(leaf)[0] for leaf in read(self._history.outputs, slots)]
-
-    def _replayed(self, row: HeldRow, start: int, stop: int) -> list[np.ndarray]:
-        """Write a row and step over order[start:stop]; return the outputs after the last row."""
-        place = np.array([row.slot, start, stop], dtype=np.int32)
-        with jax.enable_x64(True):
-            self._history, outputs = self._player.replay(
-                self._player.numbers, self._history, row.numbers, self._order, place
-            )
-        return [np.asarray(leaf) for leaf in outputs]
+    def _replayed(self, row: HeldRow, start: int, stop: int) -> np.ndarray:
+        """Write a row's numbers and step into the rows from `start` to `stop`; return the outputs after the last."""
+        held, pool = self._rows.held, self._pool
+        pool.table[row.slot, pool.numbers] = row.numbers
+        for before, after in pairwise(held[start - 1 : stop]):
+            pool.reach(before.slot, after.slot)
+        return self._outputs(held[stop - 1].slot)
 
     def _finalise(self) -> None:
-        """Move the base up to the watermark."""
+        """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
         base, forced = self._rows.finalise(self.now - self.window)
         if not base:
             return
@@ -331,26 +340,13 @@ class Timeline:
             for place, _, time in row.events:
                 if place >= 0:
                     self._last[place] = time
-        count = len(self._rows.held)
-        self._order[:count] = self._order[base : base + count].copy()
-        self._unread += [row for row in final if row.has_data()]
-        self._left += [row.slot for row in left]
+        read = [row for row in final if row.has_data()]
+        self._finals.add(np.array([row.key[0] for row in read]), self._outputs([row.slot for row in read]))
+        self._pool.give([row.slot for row in left])
 
-    def _collect(self) -> None:
-        """Read the outputs of final rows from the history, and free the slots that are no longer needed."""
-        for begin in range(0, len(self._unread), READ):
-            rows = self._unread[begin : begin + READ]
-            slots = np.zeros(READ, dtype=np.int32)
-            slots[: len(rows)] = [row.slot for row in rows]
-            with jax.enable_x64(True):
-                outputs = [np.asarray(leaf)[: len(rows)] for leaf in read(self._history.outputs, slots)]
-            self._finals.add(np.array([row.key[0] for row in rows]), outputs)
-        self._free += self._left
-        self._unread, self._left = [], []
-
-    def _named(self, outputs: list[np.ndarray]) -> dict[str, dict[str, Estimate]]:
+    def _named(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""
-        result = jax.tree.unflatten(self._player.structure, outputs)
+        result = self._player.step_rows.outputs.tree(outputs)
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
         return {

@@ -42,6 +42,9 @@ from .relays import (
 from .sensor import (
     AbstractSensor as AbstractSensor,
 )
+from .sensor_bias import (
+    with_sensor_bias as with_sensor_bias,
+)
 from .trigger import (
     AbstractTrigger as AbstractTrigger,
     SendReason as SendReason,

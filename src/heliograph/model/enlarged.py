@@ -118,13 +118,14 @@ Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
 class Clock(NamedTuple):
     """A clock that shows t + offset at t; the offset grows by `drift` a unit of time, the drift wanders.
 
-    offset, drift: their standard deviations at the start, where both have mean 0; wander: variance that the drift gains
-    at each step.
+    offset, drift: their standard deviations at the start; wander: variance that the drift gains at each step; delay:
+    mean of the offset at the start, by which stamps are late (`fit` learns it against a truth). The drift has mean 0.
     """
 
     offset: float
     drift: float
     wander: float = 0.0
+    delay: float = 0.0
 
 
 class Stamped(AbstractSensor):
@@ -209,9 +210,10 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
     # Independent initial offset and drift of each clock; drift is a random walk.
-    spread, wander = [], []
+    spread, wander, start_at = [], [], []
     for name, clock in clocks.items():
-        for part in Clock._fields:
+        start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
+        for part in ("offset", "drift", "wander"):
             scalar(f"{part} of the clock of {name!r}", getattr(clock, part), 0.0)
         spread += [clock.offset**2, clock.drift**2]
         wander += [0.0, clock.wander]
@@ -219,7 +221,8 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
-    center = library(plant.initial_mean).concatenate([plant.initial_mean - law.mean, np.zeros(len(move))])
+    xp = library(plant.initial_mean, start_at)
+    center = xp.concatenate([plant.initial_mean - law.mean, xp.stack([xp.asarray(x) for x in start_at])])
     states = (*plant.states, *(f"{name}_{part}" for name in clocks for part in ("offset", "drift")))
     # Block-diagonal dynamics of (x, clocks).
     if isinstance(plant, LinearPlant):

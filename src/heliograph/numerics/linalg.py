@@ -166,7 +166,7 @@ def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
 
     The root is taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
     """
-    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole
+    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot, 1000) * whole
     beyond = jnp.where(singular, jnp.inf, jnp.nan)
     return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
 
@@ -181,10 +181,13 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """`solve` of one A for several B, one after another: it is factored once."""
-    n = a.shape[0]
-    if n > UNROLL_LIMIT:
-        return partial(_over_matrices, _long_solve, a)
+    return partial(_over_matrices, _long_solve, a) if len(a) > UNROLL_LIMIT else written_solver(a)
+
+
+def written_solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """`solver` written out entry by entry, whatever the size."""
     columns, scales = factor(a)
+    n = len(a)
 
     def solved(b: jax.Array) -> jax.Array:
         forward: list[jax.Array] = []

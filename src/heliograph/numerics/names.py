@@ -9,6 +9,10 @@ import lazy_loader
 
 MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing
+MEANT = {  # what others call it, in plain letters
+    "kf": "kalmanfilter", "ekf": "extendedfilter", "ckf": "cubaturefilter", "ukf": "unscentedfilter",
+    "filter": "kalmanfilter", "batch": "run", "batchfilter": "run",
+}  # fmt: skip
 
 
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
@@ -34,9 +38,10 @@ def closest(name: str, known: Mapping[str, str]) -> list[str]:
     plain: dict[str, str] = {}
     for item, shown in known.items():
         plain.setdefault(_plain(item), shown)
+    meant = [item for item in plain if item == MEANT.get(_plain(name))]
     alike = get_close_matches(_plain(name), plain, MOST, ALIKE)
     around = [item for item in plain if len(name) > 2 and _plain(name) in item]  # kalman: kalman_filter
-    return [plain[item] for item in dict.fromkeys([*alike, *around])][:MOST]
+    return [plain[item] for item in dict.fromkeys([*meant, *alike, *around])][:MOST]
 
 
 def _plain(name: str) -> str:

@@ -11,10 +11,6 @@ from .comparisons import (
 from .error import (
     Error as Error,
 )
-from .feedback import (
-    fed_back_channel as fed_back_channel,
-    feedback_limit as feedback_limit,
-)
 from .messages import (
     MessageRate as MessageRate,
     delta_for_rate as delta_for_rate,

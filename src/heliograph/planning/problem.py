@@ -12,7 +12,7 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, as_budget
 from heliograph.planning.error import Error
-from heliograph.planning.numbers.free_numbers import Build
+from heliograph.planning.numbers.problem import Build
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.realised import designed_network
 from heliograph.simulation.network import Network

@@ -144,7 +144,7 @@ class Contaminated(AbstractNoise):
         units = xp.broadcast_to(factor, (n,))
         part = scalar("share of outliers", share, 0.0, 1.0) / count
         spreads = [inlier + v * xp.outer(units, units) for v in variance]
-        return cls(inlier, [part] * count, spreads, [m * units for m in center])
+        return cls(inlier, xp.stack([part] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
 
     @classmethod
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":

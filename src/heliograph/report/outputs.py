@@ -1,6 +1,7 @@
-"""Innovations of a run, output by output: how many values were down-weighted, their bias, and which output to blame."""
+"""Innovations of a run by output: values down-weighted, bias, which to blame; and errors of its filters."""
 
-from collections.abc import Iterator
+from collections import defaultdict, deque
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,10 +12,39 @@ from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import STRENGTH, Innovation
+from heliograph.model.estimate import STRENGTH, Innovation, weakest
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
+
+
+class Errors(NamedTuple):
+    """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
+
+    `claim` is what holds in all rows; `nees` is NaN where nothing is claimed.
+    """
+
+    node: str
+    filter: str
+    claim: str
+    rmse: dict[str, float]
+    nees: float
+
+
+def errors_of(record: Record) -> list[Errors]:
+    """Compare each filter with the truth; nothing without one."""
+    if record.truth is None:
+        return []
+    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
+    results = []
+    for node, estimates in record.estimates.items():
+        for name, estimate in estimates.items():
+            values = record.nees(node, name)
+            judged = ~np.isnan(values)
+            size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
+            claim = weakest(np.unique(estimate.claims).tolist())
+            results.append(Errors(node, name, claim, record.rmse(node, name), size))
+    return results
 
 
 class OutputHealth(NamedTuple):
@@ -94,14 +124,42 @@ def outputs_of(listener: Listener, inputs: np.ndarray) -> list[OutputHealth]:
     """Summarise the innovations of one filter that claims a covariance, by output."""
     result = listener.filter.run(listener.measurements, inputs)
     innovation = Innovation(result.innovations, result.innovation_covariances, result.log_likelihoods, result.weights)
+    return _health(listener.node, listener.name, listener.outputs, innovation, listener.blames)
+
+
+def _health(node: str, name: str, outputs: Sequence[str], innovation: Innovation, blames: bool) -> list[OutputHealth]:
     summaries = summarise_innovations(innovation)
-    outliers, weighed = outlying(summaries), result.weights is not None
+    outliers, weighed = outlying(summaries), innovation.weight is not None
     return [
-        OutputHealth(
-            listener.node, listener.name, name, weighed, weighed and listener.blames and i in outliers, summary
-        )
-        for i, (name, summary) in enumerate(zip(listener.outputs, summaries, strict=True))
+        OutputHealth(node, name, output, weighed, weighed and blames and i in outliers, summary)
+        for i, (output, summary) in enumerate(zip(outputs, summaries, strict=True))
     ]
+
+
+class RecentOutputs:
+    """Innovations of the newest rows of filters that weigh, summarised by output on request.
+
+    `names`: of the received numbers, by node and filter; numbers from 1 where they are not known.
+    """
+
+    def __init__(self, rows: int, names: Mapping[tuple[str, str], Sequence[str]]):
+        self.names = names
+        self._rows: dict[tuple[str, str], deque[np.ndarray]] = defaultdict(lambda: deque(maxlen=rows))
+
+    def add(self, node: str, name: str, outputs: Mapping[str, Sequence[float | None]]) -> None:
+        """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
+        row = [outputs[part] for part in ("value", "variance", "weight")]
+        self._rows[node, name].append(np.array(row, dtype=float))
+
+    def health(self) -> list[OutputHealth]:
+        """Summarise each output of each filter over its newest rows."""
+        result = []
+        for (node, name), rows in self._rows.items():
+            value, variance, weight = np.moveaxis(np.array(rows), 1, 0)
+            covariance = np.einsum("ti,ij->tij", variance, np.eye(value.shape[1]))
+            names = self.names.get((node, name)) or [str(i + 1) for i in range(value.shape[1])]
+            result += _health(node, name, names, Innovation(value, covariance, np.zeros(len(value)), weight), True)
+        return result
 
 
 def weighed_outputs(network: Network, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
@@ -122,3 +180,10 @@ def output_numbers(item: OutputHealth) -> dict[str, Json]:
     if item.weighs:
         counted |= {"down_weighted": summary.down_weighted, "to_blame": item.to_blame}
     return counted | {name: None if np.isnan(value) else value for name, value in values.items()}
+
+
+def output_row(item: OutputHealth) -> dict[str, Json]:
+    """Return the numbers of one output with its names, and in words."""
+    words = str(item.summary) + ("; to blame" if item.to_blame else "")
+    named: dict[str, Json] = {"node": item.node, "filter": item.filter, "output": item.output, "words": words}
+    return named | output_numbers(item)

@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.report.errors import errors_of
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import output_numbers
+from heliograph.report.outputs import errors_of, output_numbers
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED

@@ -25,6 +25,20 @@ class Output(NamedTuple):
     body: bytes
 
 
+class WeighedOutputs(BaseModel):
+    """Innovations and weights of a filter that weighs, by received number; null where none arrived.
+
+    Args:
+        value: innovations, in the units of the numbers.
+        variance: their variances by the filter's model.
+        weight: weights in the update, from 0 (left out) to 1 (in full).
+    """
+
+    value: list[float | None]
+    variance: list[float | None]
+    weight: list[float | None]
+
+
 class FilterOutput(BaseModel):
     """Estimate of one filter; null stands for a number that is not finite.
 
@@ -36,6 +50,7 @@ class FilterOutput(BaseModel):
             estimates, which receives no measurement.
         received: number of received components, the expected value of `nis`.
         implausible: reason why this filter alone did not use the measurement; empty if it did.
+        outputs: of a filter that weighs, what it made of each received number; left out of all others.
     """
 
     mean: list[float | None]
@@ -46,6 +61,7 @@ class FilterOutput(BaseModel):
     )
     received: int = Field(0, description="How many numbers were received: what nis should be on average.")
     implausible: str = Field("", description="Why this filter alone did not use what was received, where it did not.")
+    outputs: WeighedOutputs | None = Field(None, description="Of a filter that weighs: what it made of each number.")
 
 
 class SenderOutput(BaseModel):

@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
+from heliograph.report.outputs import output_numbers
 from heliograph.serving.watch import Watch
 
 
@@ -39,6 +40,7 @@ class Tallies(Collector):
         """Yield the current metrics."""
         yield from _links(self.watch)
         yield from _nis(self.watch)
+        yield from _outputs(self.watch)
         yield _fused(self.watch)
         yield _dead(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
@@ -91,6 +93,28 @@ def _nis(watch: Watch) -> Iterable[Metric]:
         for metric, value in zip((ratio, low, high), (item.ratio, *item.band()), strict=True):
             metric.add_metric(list(key), value)
     return ratio, low, high
+
+
+def _outputs(watch: Watch) -> Iterable[Metric]:
+    what = {
+        "weight": "Mean weight of an output's values, of the last rows of a filter that weighs; 1 counts in full.",
+        "share": "Share of an output's values that were down-weighted, below a weight of 1/2.",
+        "share_low": "Lower end of its interval of 95 %.",
+        "share_high": "Upper end of its interval of 95 %.",
+        "bias": "Median of an output's innovations, in its unit.",
+        "squared": "Mean square of an output's innovations over their variance; 1.",
+    }
+    metrics = {
+        name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])
+        for name, words in what.items()
+    }
+    # Numbers of each output of each filter that weighs; none where there are too few rows.
+    for item in watch.outputs.health():
+        numbers = output_numbers(item)
+        for name, metric in metrics.items():
+            if isinstance(value := numbers[name], float):
+                metric.add_metric([item.node, item.filter, item.output], value)
+    return metrics.values()
 
 
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"

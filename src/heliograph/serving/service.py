@@ -16,7 +16,7 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Finalised, Fleet
-from heliograph.serving.lanes import Lanes, Place
+from heliograph.serving.lanes import Lanes, Place, WeighedAt
 from heliograph.serving.message import Message, Payload, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
@@ -56,6 +56,9 @@ class OutputWriter:
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
         if judged is None:
             return results
+        if place.weighed is not None:
+            parts = zip(WeighedAt._fields, place.weighed, strict=True)
+            results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
         if outputs[judged.reason] > 0:
             why = in_words(outputs[judged.reason], outputs[judged.distance])
             return results | {"nis": None, "received": 0, "implausible": why}

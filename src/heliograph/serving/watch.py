@@ -16,6 +16,7 @@ from heliograph.live.event import VERDICTS
 from heliograph.live.player import TIME_STEP
 from heliograph.model.estimate import Claim
 from heliograph.numerics.types import unit_of
+from heliograph.report.outputs import RecentOutputs, output_row
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -80,6 +81,15 @@ POINTS = 800  # estimates remembered of each, final ones and those that are not 
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
+
+
+COUNTED = {  # of a node's messages
+    "late": "came too late to be used; a longer --window would hold what they change",
+    "future": "are later than they can be; its clock is wrong",
+    "implausible": "are implausible and were refused; their lines say why",
+    "dropped": "values are beyond its limits, or codes, and count as not arrived",
+    "conflict": "came again with other values; the first stayed",
+}
 
 
 class Link(Protocol):
@@ -163,8 +173,8 @@ class Watch:
         states: names of the states; a name with a `unit` has it on the axes.
         title: name of the network.
         time_unit: unit of times that are numbers.
-        fused: by the name of a fusion of estimates its claim, and the (node, filter) that it fuses: it has no
-            innovation, so that it is judged by theirs.
+        fused: by the name of a fusion its claim, and the (node, filter) that it fuses, by which it is judged.
+        names: names of the received numbers by node and filter.
     """
 
     def __init__(
@@ -173,16 +183,19 @@ class Watch:
         title: str = "",
         time_unit: str = "",
         fused: Mapping[str, tuple[Claim, Sequence[tuple[str, str]]]] | None = None,
+        names: Mapping[tuple[str, str], Sequence[str]] | None = None,
     ):
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused = dict(fused or {})
-        self.lock = threading.Lock()
+        # Of all plants together, of each plant, and histograms.
+        self.lock, self._count = threading.Lock(), 0
         self.services: list[Serves] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
+        self.outputs = RecentOutputs(MEMORY, names or {})
+        self._outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
-        self._count = 0
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
         what = "From when the oldest message of a batch was measured, where it has a date, to what is published."
@@ -208,12 +221,16 @@ class Watch:
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
         local = _newest(self._tests, plant, dict)
+        recent = self.outputs, _newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
         for node, filters in estimates.items():
             for name, message in filters.items():
                 if message.get("nis") is not None:
                     for item in (self.nis, local):
                         single = item.setdefault((node, name), RunningNis(message["claim"]))
                         single.add(message["nis"], message["received"])
+                if message.get("outputs") and message.get("received"):
+                    for outputs in recent:
+                        outputs.add(node, name, message["outputs"])
 
     def _keep(self, plant: str, message: Mapping[str, Any]) -> None:
         self._count += 1
@@ -250,6 +267,7 @@ class Watch:
             results = [item for known, item in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
+            health = self._outputs[name].health() if name in self._outputs else []
             names = sorted(known for known, _ in self.plants())
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
             return {
@@ -266,6 +284,7 @@ class Watch:
                 "links": _added(results),
                 "senders": senders,
                 "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
+                "outputs": [output_row(item) for item in health],
                 "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": _added(item for _, item in self.plants()),
@@ -297,16 +316,7 @@ class Watch:
                 chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
                 yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
         for node, link in _added(plants).items():
-            if link["late"]:
-                yield f"{node}: {link['late']} came too late to be used; a longer --window would hold what they change"
-            if link["future"]:
-                yield f"{node}: {link['future']} are later than they can be; its clock is wrong"
-            if link["implausible"]:
-                yield f"{node}: {link['implausible']} are implausible and were refused; their lines say why"
-            if link["dropped"]:
-                yield f"{node}: {link['dropped']} values are beyond its limits, or codes, and count as not arrived"
-            if link["conflict"]:
-                yield f"{node}: {link['conflict']} came again with other values; the first stayed"
+            yield from (f"{node}: {link[name]} {words}" for name, words in COUNTED.items() if link[name])
 
 
 class Watched:
@@ -349,7 +359,7 @@ def _newest(result: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T
 def _band(message: Mapping[str, Any]) -> dict[str, object]:
     """Return means, and standard deviations where the filter claims a covariance."""
     rows = message["covariance"]
-    claimed = None if rows is None else [_root(row[i]) for i, row in enumerate(rows)]
+    claimed = rows and [_root(row[i]) for i, row in enumerate(rows)]
     return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"]}
 
 
@@ -370,15 +380,8 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
 
 def _test_row(node: str, filter_name: str, item: RunningNis) -> dict[str, object]:
     low, high = item.band()
-    numbers = {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
-    return {
-        "node": node,
-        "filter": filter_name,
-        "claim": item.claim,
-        **numbers,
-        "doubt": item.doubt() is not None,
-        "by": [],
-    }
+    names = {"node": node, "filter": filter_name, "claim": item.claim, "doubt": item.doubt() is not None, "by": []}
+    return names | {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
 
 
 def watch_of(network: Network, title: str) -> Watch:
@@ -389,4 +392,9 @@ def watch_of(network: Network, title: str) -> Watch:
         for name, item in network.fused.items()
         if isinstance(item, Fusion)
     }
-    return Watch(network.states, title, "s" if TIME_STEP in network.inputs else "steps", fused)
+    names: dict[tuple[str, str], Sequence[str]] = {
+        (node, name): place.received_names for node, place in network.nodes.items() for name in place.filters
+    }
+    all_names = [f"{node}: {name}" for node, place in network.nodes.items() for name in place.received_names]
+    names |= {(FUSED, name): all_names for name in network.fused}
+    return Watch(network.states, title, "s" if TIME_STEP in network.inputs else "steps", fused, names)

@@ -25,12 +25,12 @@ from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
 from heliograph.simulation.description.diagram import short_text_of, table_of
-from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import (
     Common,
     Node,
     ReceivingNode,
     check_filters,
+    check_flags,
     check_received,
     check_sizes,
     check_type,

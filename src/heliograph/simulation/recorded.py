@@ -18,12 +18,14 @@ from heliograph.simulation.judging import any_implausible, doubts, forbidden_row
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part, with_truth
-from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.smoothed import Smoother, found_record, smoothed_part, with_truth
+from heliograph.simulation.stepping import AllFilters, begun
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
+
+ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
 
 Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
 
@@ -146,10 +148,27 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 def _filtered(*arguments: PyTree) -> PyTree:
     """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
-    filters = arguments[0]
-    if filters.meshes:  # nodes by the hundred are no straight-line code
-        return to_numpy(_by_xla(*arguments))
-    return computed(_run_filters, _by_xla, arguments)
+    # Nodes by the hundred are no straight-line code.
+    return _in_parts(*arguments) if arguments[0].meshes else computed(_run_filters, _by_xla, arguments)
+
+
+def _in_parts(
+    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
+    without: bool,
+) -> PyTree:  # fmt: skip
+    """Scan over some rows at a time, with the weights between neighbours of these computed ahead."""
+    count = -(-len(u) // ROWS)
+    size = -(-len(u) // count)
+    rows, states, parts = (np.arange(len(u)), u, z, arrivals), begun(filters), []
+    for start in range(0, len(u), size):
+        # The last row again until the part is full.
+        now = np.minimum(np.arange(start, start + size), len(u) - 1)
+        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, now=now: np.asarray(leaf)[now], rows)
+        drawn |= {name: (drawn[name], mesh.ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), without)
+        parts.append(to_numpy(results))
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
+    return to_numpy(_results(later, z, whole))
 
 
 def _run_filters(
@@ -157,17 +176,28 @@ def _run_filters(
     without: bool,
 ) -> PyTree:  # fmt: skip
     """Scan over all rows; `without` implausible data."""
+    return _results(later, z, _scanned(filters, filters.init(), (jnp.arange(len(u)), u, z, arrivals), without)[1])
 
+
+def _scanned(
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], without: bool
+) -> tuple[PyTree, dict[str, PyTree]]:
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row
         if without:
             return plausible_step(filters, states, z_k, u_k, k, drawn)
         return filters.step(states, z_k, u_k, k, drawn)
 
-    rows = jnp.arange(len(u)), u, z, arrivals
-    results = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
+    states, results = jax.lax.scan(body, states, rows)
+    return states, results
+
+
+def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[str, PyTree]) -> PyTree:
+    """Smoothed results where that was asked for, and what the filters judged."""
+    results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if later is None else one_run(later.both, results)) | judged
+    results = {name: part for name, part in results.items() if not name.startswith("weighed")}
+    return (results if later is None else later.both(results)) | judged
 
 
-_by_xla = quickly_compiled(_run_filters)
+_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scanned)

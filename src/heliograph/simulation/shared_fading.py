@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import at
+from heliograph.model.over_time import at, stack, structure
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories
+from heliograph.random_affine.base import AbstractRandomAffine, advance, anonymous, apply, begin, distinct, memories
 from heliograph.random_affine.delay import sent
 from heliograph.simulation.draws import (
     CHANNEL,
@@ -31,7 +33,7 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: one name for memories that differ.
     """
-    held = {name: memories(channel) for name, channel in channels.items()}
+    held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
     distinct(memory for item in held.values() for memory in item.values())
     return {
         name: np.array(
@@ -41,8 +43,39 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
             ],
             dtype=np.uint32,
         )
-        for name, item in held.items()
+        for name, item in ((name, held[id(channel)]) for name, channel in channels.items())
     }
+
+
+class ChannelGroup(Module):
+    """Channels of one structure, stacked; checksums of their names and of their memories, and their places among all.
+
+    Shapes: checksums (channel,), memories (channel, memories of each), places (channel,).
+    """
+
+    channel: Channel
+    checksums: np.ndarray
+    memories: np.ndarray
+    places: np.ndarray
+
+
+def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
+    """Stack channels by structure; each is looked at once, however many names have it."""
+    items, memories = list(channels.values()), list(memory_places(channels).values())
+    checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
+    kinds = {id(channel): anonymous(channel) for channel in {id(c): c for c in items}.values()}
+    alike: dict[object, dict[int, int]] = {}
+    for which, kind in kinds.items():
+        same = alike.setdefault(structure(kind), {})
+        same[which] = len(same)
+    results = []
+    for same in alike.values():
+        places = np.array([e for e, channel in enumerate(items) if id(channel) in same])
+        rows = np.array([same[id(items[e])] for e in places])
+        kind = stack([kinds[which] for which in same])
+        channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, kind)
+        results.append(ChannelGroup(channel, checksums[places], np.stack([memories[e] for e in places]), places))
+    return tuple(results)
 
 
 class Late(NamedTuple):

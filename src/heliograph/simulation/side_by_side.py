@@ -7,20 +7,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, step_with_judgement
 from heliograph.filters.plausibility import Judgement, Reason
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 
 
+class Weighed(NamedTuple):
+    """Innovation of a filter that weighs, by component: value, variance and weight (m,) each."""
+
+    value: jax.Array
+    variance: jax.Array
+    weight: jax.Array
+
+
 class StepOutput(NamedTuple):
-    """Output of a filter's step: its estimate, and its smoother step and judgement if asked for."""
+    """Output of a filter's step: its estimate, and its smoother step and judgement if asked for.
+
+    weighed: of a filter that judges and weighs.
+    """
 
     estimate: Estimate
     steps: AbstractSmootherStep | None = None
     judgement: Judgement | None = None
+    weighed: Weighed | None = None
 
 
 def filter_step(
@@ -44,14 +56,23 @@ def filter_step(
         judgement = item.step_judged(state, z, u, k)[2] if judges else None
         after, steps = item.step_with_smoother(state, z, u, k)
         return after, StepOutput(item.after_step(after, k), steps, judgement)
+    judgement, weighed = None, None
     if judges:
-        after, estimate, judgement = item.step_judged(state, z, u, k)
+        after, estimate, judgement, innovation = step_with_judgement(item, state, z, u, k)
+        weighed = weighed_in(innovation)
     else:
-        (after, estimate), judgement = item.step(state, z, u, k), None
+        after, estimate = item.step(state, z, u, k)
     if skip is not None:
         stays, known = skip == Reason.PREDICTION, (state, item.estimate(state))
         after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
-    return after, StepOutput(estimate, judgement=judgement)
+    return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
+
+
+def weighed_in(innovation: Innovation) -> Weighed | None:
+    """The innovation by component, of a filter that weighs; None of all others."""
+    if innovation.weight is None:
+        return None
+    return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
 
 
 class Alike(Module):

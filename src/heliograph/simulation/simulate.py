@@ -18,11 +18,21 @@ from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.reducer import AbstractReducer, Result, Trajectories
-from heliograph.simulation.runs.by_run import trajectories
-from heliograph.simulation.runs.lanes import BLOCK, Lanes, one_processor
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
+from heliograph.simulation.results.statistics import BATCHES
+from heliograph.simulation.runs.by_run import each_run, trajectories
+from heliograph.simulation.runs.lanes import (
+    BLOCK,
+    Lanes,
+    Shared,
+    added,
+    batch_counts,
+    in_chunks,
+    is_shared,
+    one_processor,
+)
 from heliograph.simulation.runs.native_runs import natively
-from heliograph.simulation.smoothed import Smoother, WithSmoothed, smoothed_part
+from heliograph.simulation.smoothed import Recorded, Smoother, finished, reduced_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -131,16 +141,13 @@ def monte_carlo(
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
-    both: WithSmoothed[PyTree] = WithSmoothed(reducer)
-    keeper = reducer if smoothing is None else both
-    job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
+    job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
     recorded = _recorded(job, first_run, runs, chunk, progress)
-    claiming = network.in_single_precision() if single else network
-    if smoothing is not None:
-        claims = lowered(smoothing.claims) if single else smoothing.claims
-        result: Record | Any = both.finished(*recorded, claiming, smoothing._replace(claims=claims))
-        return result
-    return reducer.finish(*recorded, claiming)
+    if single:
+        network = network.in_single_precision()
+        smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
+    result: Record | Any = finished(job.reducer, recorded, network, smoothing)
+    return result
 
 
 class _Job(Module):
@@ -155,9 +162,8 @@ class _Job(Module):
     single: bool = eqx.field(static=True)
 
 
-def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:
-    """Carry of the reducer after all runs, and what it collected of them, chunk by chunk."""
-    parts = []
+def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
+    """Sums over all runs, and what is collected of them, chunk by chunk."""
     with jax.enable_x64(True):
         lanes = Lanes(
             lambda blocks, carry: _lane((job, blocks), carry),
@@ -165,19 +171,21 @@ def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progre
             partial(_initial, job),
             first_run,
         )
-        blocks = lanes.blocks_of(min(chunk, runs))
-        for start in range(0, -(-runs // BLOCK), blocks):
-            begun, done = start * BLOCK, min((start + blocks) * BLOCK, runs)
-            parts.append(jax.tree.map(lambda leaf: leaf[: done - begun], lanes.advance(start, blocks)))  # noqa: B023
-            if progress is not None:
-                progress(done, runs)
-    return lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        parts = in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
+    collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
+    total = lanes.total()
+    sums, common = (
+        jax.tree.map(read, total, is_leaf=is_shared)
+        for read in (lambda part: part.value if is_shared(part) else part, is_shared)
+    )
+    return Recorded(OfStep(*sums), OfStep(*common), batch_counts(first_run, first_run + runs), collected)
 
 
 @quickly_compiled
 def _initial(job: _Job) -> PyTree:
-    """Carry of the reducer before the first block; compiled, so that shapes are worked out once a network."""
-    return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
+    """Sums of zero before the first block; compiled, so that shapes are worked out once a network."""
+    shapes = eqx.filter_eval_shape(_block, job, np.arange(BLOCK))[0]
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
 
 
 @partial(quickly_compiled, donate="all-except-first")
@@ -186,43 +194,73 @@ def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Reduce blocks one after another, of fixed width and order of sums: so chunks do not change a bit."""
+    """Sum over blocks one after another, of fixed width and order of sums: so chunks do not change a bit."""
 
     def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
-        return job.reducer.reduce(carry, _block(job, runs), runs, runs < job.stop)
+        sums, collected = _block(job, runs)
+        return added(carry, sums), collected
 
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
 
 
 @quickly_compiled
 def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
-    """Reduce every lane's blocks, with a leading axis for the lanes."""
+    """Sum over every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
     return result
 
 
-def _block(job: _Job, runs: jax.Array) -> PyTree:
-    """Trajectories (run, time, ...) of one block of runs; (1, time, ...) for what all runs share."""
-    if not job.single:
-        return _trajectories(job.world, job.later, job.inputs, job.key, runs)
-    with jax.enable_x64(False):
-        world, later, inputs = jax.tree.map(_single, (job.world, job.later, job.inputs))
-        result = _trajectories(world, later, inputs, job.key, runs)
-    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, result)
+def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
+    """Sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
+    if job.single:
+        with jax.enable_x64(False):
+            world, inputs = jax.tree.map(_single, (job.world, job.inputs))
+            result = _trajectories(world, inputs, job.key, runs)
+        result = jax.tree.map(
+            lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, result
+        )
+    else:
+        result = _trajectories(job.world, job.inputs, job.key, runs)
+    recorded = _reduced(job.reducer, job.later, result)
+    valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
+
+    # What all runs share stands as of one; of the others the axis of runs becomes one of batches, without padding.
+    def summed(leaf: jax.Array) -> PyTree:
+        if len(leaf) < len(runs):
+            return Shared(leaf[0].astype(float))
+        return by_batch(jnp.where(valid, jnp.moveaxis(leaf, 0, -1).astype(float), 0.0), start)
+
+    sums, ever = jax.tree.map(summed, (recorded.sums, recorded.ever))
+    collected = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), recorded.collected)
+    return (sums, ever), collected
+
+
+def by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
+    """Values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
+    runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
+    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
+    row = jax.lax.dynamic_update_slice(row, values, (*zero, start))
+    begin, beyond = row[..., :BATCHES], row[..., BATCHES:]
+    return jax.lax.dynamic_update_slice(begin, begin[..., : runs - 1] + beyond, (*zero, 0))
 
 
 def _single(leaf: PyTree) -> PyTree:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _simulated(world: World, later: Smoother | None, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
+def _simulated(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
-    result = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
-    return result if later is None else later.both(result)
+    return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
-# Traced once, for its shapes and for the program alike: tracing is half of what a first call takes.
+def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, result: PyTree) -> OfStep:
+    recorded: OfStep = each_run(partial(reduced_run, reducer, later), result)
+    return recorded
+
+
+# Traced once, for their shapes and for the program alike: tracing is half of what a first call takes.
 _trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulated, inline=True)  # type: ignore[call-overload]
+_reduced: Callable[..., OfStep] = eqx.filter_jit(_each_reduced, inline=True)  # type: ignore[call-overload]
 
 
 def simulate(

@@ -1,8 +1,7 @@
 """Smoothed estimates of a network, from the smoother steps of its filters."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
@@ -25,8 +23,14 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
-from heliograph.simulation.runs.by_run import each_run
+from heliograph.simulation.results.reducer import (
+    AbstractReducer,
+    OfStep,
+    Result,
+    Trajectories,
+    of_rows,
+    trajectories_record,
+)
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.modes import AbstractSmoothing, nis_sums, warn_of
 
@@ -43,19 +47,19 @@ class Smoother(Module):
     groups: tuple[int, ...] = eqx.field(static=True)
 
     def both(self, result: PyTree) -> PyTree:
-        """Results of runs (run, time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
+        """Results of a run (time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
         steps_by_kind = [result["smoother_steps"][k] for k in self.kinds]
         filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "central_steps")}
-        surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         # Smoothed estimates of nodes and central filters, then their fusions.
-        estimates = tuple(self._estimates(steps, 2) for steps in steps_by_kind)
-        fused = {name: self._estimates(steps, 0) for name, steps in result["central_steps"].items()}
+        sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
+        estimates = tuple(sweep(steps) for steps in steps_by_kind)
+        fused = {name: self.smoothing.sweep(steps) for name, steps in result["central_steps"].items()}
         for item in self.fusions:
-            fused |= each_run(partial(_combined, item), estimates)
-        # As a block of the steps that are smoothed.
-        length = jax.tree.leaves((estimates, fused))[0].shape[1]
+            fused |= _combined(item, estimates)
+        # As of the steps that are smoothed.
+        length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
-            "measurements": tuple(result["measurements"][g][:, -length:] for g in self.groups),
+            "measurements": tuple(result["measurements"][g][-length:] for g in self.groups),
             "estimates": estimates,
             "fused": fused,
             "uplinks": {},
@@ -65,8 +69,9 @@ class Smoother(Module):
             truth = self.smoothing.about(result["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_by_kind])}
         # Sums of the NIS, for the test of consistency.
-        nis = tuple(each_run(surprised, steps) for steps in steps_by_kind)
-        centrally = {name: each_run(nis_sums, steps) for name, steps in result["central_steps"].items()}
+        surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
+        nis = tuple(surprised(steps) for steps in steps_by_kind)
+        centrally = {name: nis_sums(steps) for name, steps in result["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
     def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
@@ -74,32 +79,31 @@ class Smoother(Module):
 
         def near(estimate: Estimate, which: Angles) -> Estimate:
             mean = jnp.asarray(estimate.mean)
-            others = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), truth.shape[-1])
+            others = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
             return Estimate(nearest(mean, others, which), estimate.covariance, estimate.claim)
 
         every = next((which for which in angles if which), ())
         estimates = tuple(near(item, which) for item, which in zip(known["estimates"], angles, strict=True))
         return {"estimates": estimates, "fused": {name: near(item, every) for name, item in known["fused"].items()}}
 
-    def _estimates(self, steps: AbstractSmootherStep, axes: int) -> Estimate:
-        """Smoothed estimates of runs (run, time, ...), with so many axes after time; common covariances once."""
-
-        def over(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree], PyTree]:
-            for _ in range(axes):
-                function = jax.vmap(function, in_axes=1, out_axes=1)
-            return function
-
-        if len(steps.covariance) == len(steps.mean):
-            result: Estimate = each_run(over(self.smoothing.sweep), steps)
-            return result
-        covariances = each_run(over(self.smoothing.covariances), steps)
-        return Estimate(each_run(over(self.smoothing.means), steps), covariances, steps.claim)
-
 
 def _combined(item: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
     """Fuse estimates (time, filter, node, ...) at each time."""
     result: dict[str, Estimate] = jax.vmap(lambda parts: item.step((), parts, jnp.asarray(0))[1])(estimates)
     return result
+
+
+def reduced_run(reducer: AbstractReducer[Result], later: Smoother | None, result: PyTree) -> OfStep:
+    """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
+    if later is None:
+        return of_rows(reducer, result)
+    both = later.both(result)
+    filtered, smoothed = of_rows(reducer, both["filtered"]), of_rows(reducer, both["smoothed"])
+    return OfStep(
+        (filtered.sums, smoothed.sums, both["nis"]),
+        (filtered.ever, smoothed.ever),
+        (filtered.collected, smoothed.collected),
+    )
 
 
 class Part(NamedTuple):
@@ -172,11 +176,6 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_of(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def one_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
-    """Apply a function of runs (run, ...) to one without an axis of runs."""
-    return jax.tree.map(lambda leaf: leaf[0], function(jax.tree.map(lambda leaf: leaf[None], values)))
-
-
 def found_record(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
     """Record of a recording, with its smoothed part."""
     if part is None:
@@ -207,49 +206,32 @@ def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Ab
     return replace(record, truth=truth, estimates=estimates, smoothed=later)
 
 
-class WithSmoothed(AbstractReducer[Result]):
-    """Reduction of filtered estimates, of smoothed ones, and sums of the NIS.
+class Recorded(NamedTuple):
+    """Sums by batch of `runs` each and what is collected of all runs; `common`: whether all runs share a sum."""
 
-    A block is {"filtered", "smoothed", "nis"}; the first two are such as the reducer expects.
-    """
+    sums: OfStep
+    common: OfStep
+    runs: np.ndarray
+    collected: PyTree
 
-    reducer: AbstractReducer[Result]
 
-    def initial(self, shapes: PyTree) -> PyTree:
-        """Return both carries, and zero sums of the NIS."""
-        nis = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["nis"])
-        return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), nis
-
-    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Reduce both, and add the NIS of valid runs."""
-        filtered, smoothed, nis = carry
-        filtered, recorded = self.reducer.reduce(filtered, batch["filtered"], runs, valid)
-        smoothed, kept_later = self.reducer.reduce(smoothed, batch["smoothed"], runs, valid)
-
-        def added(total: jax.Array, part: jax.Array) -> jax.Array:
-            values = jnp.broadcast_to(part, (len(valid), *part.shape[1:]))
-            return total + jnp.sum(jnp.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0), axis=0)
-
-        nis = jax.tree.map(added, nis, batch["nis"])
-        return (filtered, smoothed, nis), (recorded, kept_later)
-
-    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
-        """Return both carries, from sums that are pairs; and the NIS."""
-        filtered, smoothed = (
-            self.reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count)
-            for i in (0, 1)
+def finished(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, part: Part | None) -> Result:
+    """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
+    sums, common, count, collected = recorded
+    # Without smoothing the result of the network alone.
+    if part is None:
+        return reducer.finish(reducer.summed(sums, common, count), collected, network)
+    # Pairs of filtered and smoothed estimates, and sums of the NIS over all runs.
+    nis = jax.tree.map(
+        lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
+    )
+    _warn_of_inconsistency(part.network, nis)
+    filtered, smoothed = (
+        reducer.finish(
+            reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count),
+            collected[i],
+            of,
         )
-        nis = jax.tree.map(
-            lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
-        )
-        return filtered, smoothed, nis
-
-    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
-        """Make the result of filtered estimates alone; `finished` makes both."""
-        return self.reducer.finish(carry[0], collected[0], network)
-
-    def finished(self, carry: PyTree, collected: PyTree, network: Network, part: Part) -> Result:
-        """Make the result of the network with that of its smoothed part; warn of filters that are not consistent."""
-        _warn_of_inconsistency(part.network, carry[2])
-        smoothed = self.reducer.finish(carry[1], collected[1], part.network)
-        return self.reducer.others(self.finish(carry, collected, network), smoothed, part.claims)
+        for i, of in enumerate((network, part.network))
+    )
+    return reducer.others(filtered, smoothed, part.claims)

@@ -129,6 +129,7 @@ class AllFilters(Module):
         Returns "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of fusions with quantizers, and
         "reports" with their delays by fusion, as the nodes send them; if asked for, the smoother steps,
         "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
+        "weighed" and "weighed_centrally" of those that weigh;
         `skip` has the reasons of the same form not to use data.
         """
         filter_states, central, quantizer_states, centre_states, reporting = states
@@ -170,10 +171,11 @@ class AllFilters(Module):
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
         for name, mesh in sorted(self.meshes.items()):
-            flags = mesh.edges.lossless() if drawn is None else drawn[name]
+            happens = mesh.edges.lossless() if drawn is None else drawn[name]
+            flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
             if drawn is None and mesh.edges.groups:
                 raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
-            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k)
+            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Next states and results.
         filter_states = tuple(state for state, _ in stepped)
@@ -186,6 +188,8 @@ class AllFilters(Module):
         if self.judges:
             outputs["judged"] = tuple(single.judgement for _, single in stepped)
             outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
+            outputs["weighed"] = tuple(single.weighed for _, single in stepped)
+            outputs["weighed_centrally"] = {name: single.weighed for name, (_, single) in received.items()}
         return following, outputs
 
     def _centred(

@@ -77,10 +77,6 @@ class AbstractSmoothing(Module):
         """Means alone, where covariances are known from elsewhere."""
         return jnp.asarray(self.sweep(steps).mean)
 
-    def covariances(self, steps: AbstractSmootherStep) -> jax.Array:
-        """Covariances alone, whatever the data were."""
-        return jnp.asarray(self.sweep(steps.without_data()).covariance)
-
     def about(self, values: A) -> A:
         """Select from `values` along time (..., time, n), such as the true state, those that the estimates refer to."""
         return values

@@ -4,23 +4,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import (
-    AMBER,
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    PURPLE,
-    STYLE,
-    VERMILION,
-    WIDTH,
-    Curve,
-    label_right,
-)
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, STYLE, VERMILION, WIDTH
 from heliograph_studies.cubature_fusion.compute import Outcome, Runs
 from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
 from heliograph_studies.cubature_fusion.statements import BETTER, METHOD, TWIN
+from heliograph_studies.curves import Curve, Panel, curves_over_time, label_right
 
 COLOURS = {
     "open_loop": MUTED, "mean_gain": AMBER, "cubature_printed_fixed": VERMILION, "cubature_printed": PURPLE,

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, VERMILION, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time
 from heliograph_studies.delays.compute import Clocks, Deviation, Outcome
 from heliograph_studies.delays.setting import STEP
 

@@ -3,17 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.figures import (
-    BLUE,
-    GREEN,
-    MUTED,
-    PURPLE,
-    VERMILION,
-    Curve,
-    consistency_over_time,
-    errors_with_bands,
-    paths,
-)
+from heliograph.report.figures import BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, consistency_over_time, errors_with_bands, paths
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.calibration import CALIBRATED, WINDOW
 from heliograph_studies.demo.compute import NAMES, Outcome

@@ -6,20 +6,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import (
-    AMBER,
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    PALE,
-    PURPLE,
-    STYLE,
-    VERMILION,
-    WIDTH,
-    Curve,
-)
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PALE, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph_studies.curves import Curve, Panel, curves_over_time
 from heliograph_studies.h_infinity_fusion import structured
 from heliograph_studies.h_infinity_fusion.compute import Outcome
 from heliograph_studies.h_infinity_fusion.discriminating import NODE

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, VERMILION, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
 from heliograph_studies.intermittent_observations.compute import Outcome
 
 BURST_COLOURS = (GREEN, BLUE, AMBER)

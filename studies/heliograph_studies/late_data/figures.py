@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION, Curve, paths
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time, paths
 from heliograph_studies.late_data.compute import Outcome, Through
 from heliograph_studies.late_data.moving import BEGIN
 from heliograph_studies.late_data.plaza import DRIVE

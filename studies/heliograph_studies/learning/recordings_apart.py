@@ -7,8 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.codegen.engine import chosen
-from heliograph.learning.description import describe
-from heliograph.learning.free_marks import Build
+from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
 from heliograph.learning.likelihood.maximise import Evaluated, maximise
 from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, objectives, one_recording

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
 from heliograph_studies.links_with_memory.compute import Outcome
 
 ROWS = {  # filter: how it is called, and its colour

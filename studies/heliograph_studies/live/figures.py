@@ -2,7 +2,8 @@
 
 from matplotlib.figure import Figure
 
-from heliograph.report.figures import BLUE, GREEN, VERMILION, Curve, paths
+from heliograph.report.figures import BLUE, GREEN, VERMILION
+from heliograph_studies.curves import Curve, paths
 from heliograph_studies.live.compute import Outcome
 from heliograph_studies.live.killed import WINDOW
 

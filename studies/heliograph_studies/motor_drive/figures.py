@@ -3,19 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import (
-    AMBER,
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    PURPLE,
-    VERMILION,
-    Curve,
-    consistency_over_time,
-    errors_with_bands,
-)
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, consistency_over_time, curves_over_time, errors_with_bands
 from heliograph_studies.motor_drive.compute import CASES, TRUSTS, Outcome
 from heliograph_studies.motor_drive.drive import LOAD_STEP, LOAD_STEP_AT
 from heliograph_studies.motor_drive.machine import RATED, STEP

@@ -7,6 +7,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import heliograph as hg
 from heliograph_studies.network_design import setting
+from heliograph_studies.network_design.theory import feedback_limit
 
 PLANT = hg.LinearPlant([[1.1, 0.2], [0.2, 0.8]], np.eye(2), [0.0, 0.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 1.0]], 1.0)
@@ -51,7 +52,7 @@ def packets(times: float) -> dict[str, float]:
     """
 
     def error(arrival: float) -> float:
-        predicted = hg.planning.feedback_limit(PLANT, SENSOR, [hg.hop(1.0, 1 / arrival - 1)], 1.0).predicted
+        predicted = feedback_limit(PLANT, SENSOR, [hg.hop(1.0, 1 / arrival - 1)], 1.0).predicted
         return np.inf if predicted is None else float(np.trace(predicted))
 
     lowest = 1 - 1 / float(np.max(np.abs(np.linalg.eigvals(PLANT.matrix)))) ** 2

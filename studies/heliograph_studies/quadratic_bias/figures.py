@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time
 from heliograph_studies.quadratic_bias.compute import CLAIMED, NODE, TRUE, Numbers, Outcome
 
 COLOURS = {

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over
-from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION, Curve, paths
+from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over, paths
 from heliograph_studies.range_bearing.compute import Outcome
 
 LABELS = {

@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION, Curve, errors_with_bands
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time, errors_with_bands
 from heliograph_studies.smoothing.compute import LAG_STEP, LAGS, Outcome, places
 
 COLOURS = dict(zip(LAGS, (AMBER, PURPLE, GREEN, VERMILION), strict=True))

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time
 from heliograph_studies.successive_relays.compute import FILTERS, Outcome
 from heliograph_studies.successive_relays.setting import STATES
 from heliograph_studies.successive_relays.statements import worst_z, z_limit

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
@@ -13,7 +12,7 @@ from heliograph.model.estimate import Innovation
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
 from heliograph_studies.uwb.drives import Drive, drives
-from heliograph_studies.uwb.learning import followed, learn, slots
+from heliograph_studies.uwb.learning import followed, learn, padded, slots, true_places
 from heliograph_studies.uwb.radio import Loss, Power, losses, power
 from heliograph_studies.uwb.setting import BEST, STARTS, Numbers, Setting
 
@@ -93,20 +92,16 @@ def of_drive(drive: Drive, others: Sequence[Drive], iterations: int) -> OfDrive:
     )  # fmt: skip
 
 
-_followed = jax.jit(followed, static_argnums=0)
-
-
 def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     """The rule's path against the reference, and what its innovations say of the anchors."""
     read = slots(drive)
-    with jax.enable_x64(True):
-        result = _followed(rule, np.array(numbers), drive.places, drive.truth[0, :2], read.ranges, read.dt)
-    place, covariance, innovation, variance, weight = (np.asarray(value) for value in result)
+    length = len(read.time)
+    result = followed(rule, [numbers], padded([drive]))
+    place, covariance, innovation, variance, weight, _ = (value[0, :length] for value in result)
     used = (read.time >= drive.window[0]) & (read.time <= drive.window[1])
 
     def off(time: np.ndarray, estimate: np.ndarray) -> np.ndarray:
-        true = np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
-        return np.asarray((estimate - true)[used])
+        return np.asarray((estimate - true_places(drive, time))[used])
 
     # The place that a range is of lies before its stamp; the place at the stamp is predicted.
     error = off(read.time - numbers.late, place)

@@ -3,19 +3,25 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION, Curve, paths
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time, paths
 from heliograph_studies.uwb.compute import OfDrive, Outcome, best_of
-from heliograph_studies.uwb.setting import BEST
+from heliograph_studies.uwb.setting import BEST, BIAS, BIASED
 
-NAMES = {
+WHITE = {
     "plain": "no doubt",
     "gate": "chi-squared gate",
     "huber": "Huber",
+    "wolf": "WoLF",
     "inverse_multiquadric": "inverse multiquadric",
     "student": "Student, score",
     "contaminated": "contaminated, score",
-    "memory": "contaminated, errors with memory",
+    "one_sided": "one-sided, score",
+}
+NAMES = {
+    **WHITE,
+    **{rule + BIAS: f"{WHITE[rule]}, bias of each anchor" for rule in BIASED},
+    BEST: "contaminated, errors with memory",
 }
 COLOURS = (BLUE, AMBER, PURPLE, GREEN, VERMILION)
 SMOOTH = 50  # slots over which weights are averaged for the eye

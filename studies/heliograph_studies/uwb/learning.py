@@ -1,14 +1,16 @@
 """One setting of a rule from several drives: the one that gives their true places the largest mean log density."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import expit
 
+import heliograph as hg
 from heliograph_studies.uwb.drives import Drive
 from heliograph_studies.uwb.setting import FREE, SHARES, STARTS, Numbers, filter_of, versions
 
@@ -42,47 +44,62 @@ def slots(drive: Drive) -> Slots:
 
 
 class Followed(NamedTuple):
-    """Along a drive: place (slots, 2) and covariance, innovation, its variance and weight (slots, anchors)."""
+    """Along a drive: place (slots, 2) and covariance, innovation, its variance and weight (slots, anchors), density."""
 
     place: Any
     covariance: Any
     innovation: Any
     variance: Any
     weight: Any
+    log_likelihood: Any
 
 
-def followed(rule: str, numbers: Any, anchors: Any, start: Any, z: Any, u: Any) -> Followed:
-    """Estimates of a rule after each slot: of several sizes of error the mixture, each as likely as its past ranges.
+@cache
+def single(rule: str) -> Callable[..., Followed]:
+    """A rule's way along one drive: a function of numbers, anchors, start, ranges and times between slots."""
+
+    def follow(values: Any, anchors: Any, start: Any, z: Any, u: Any) -> Followed:
+        numbers = Numbers(*values)
+        item = filter_of(rule, numbers, anchors, start)
+        frame = numbers.frame**2 * jnp.eye(2)
+
+        def step(state: Any, row: Any) -> tuple[Any, Followed]:
+            after, said = item.correct(item.predict(state, row[1]), row[0])
+            weight = jnp.where(jnp.isnan(row[0]), jnp.nan, 1.0) if said.weight is None else said.weight
+            size = jnp.diagonal(said.covariance)
+            covariance = after.covariance[:2, :2] + frame
+            return after, Followed(after.mean[:2], covariance, said.value, size, weight, said.log_likelihood)
+
+        result: Followed = jax.lax.scan(step, item.init(), (z, u))[1]
+        return result
+
+    return follow
+
+
+def followed(rule: str, numbers: Sequence[Numbers], data: "Padded") -> Followed:
+    """Estimates after each slot of several runs: of several sizes of error the mixture, each as likely as its ranges.
+
+    All runs and sizes go side by side through one program.
 
     Source: Magill, Optimal adaptive estimation of sampled stochastic processes (1965), for the mixture.
     """
-    parts = [_single(rule, item, anchors, start, z, u) for item in versions(rule, numbers)]
-    likelihood = jnp.stack([jnp.cumsum(part[-1]) for part in parts])
-    share = jax.nn.softmax(likelihood, axis=0)
-    every = [jnp.stack(values) for values in zip(*(part[:-1] for part in parts), strict=True)]
+    sized = [versions(rule, item) for item in numbers]
+    runs, sizes = len(sized), len(sized[0])
+    rows = [np.repeat(part, sizes, axis=0) for part in data]
+    result = hg.simulation.over_runs(single(rule), np.reshape(sized, (runs * sizes, -1)), *rows)
+    parts = Followed(*(value.reshape(runs, sizes, *value.shape[1:]) for value in result))
+    # Each size is as likely as it made the ranges so far.
+    likelihood = np.cumsum(parts.log_likelihood, axis=2)
+    share = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+    share = share / share.sum(axis=1, keepdims=True)
 
-    def mixed(values: jax.Array) -> jax.Array:
-        return jnp.einsum("kt,kt...->t...", share, values)
+    def mixed(values: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("rkt,rkt...->rt...", share, values))
 
-    means, covariances, *others = every
-    mean = mixed(means)
-    apart = means - mean
-    covariance = mixed(covariances + apart[..., :, None] * apart[..., None, :])
-    return Followed(mean, covariance, *(mixed(values) for values in others))
-
-
-def _single(rule: str, numbers: Numbers, anchors: Any, start: Any, z: Any, u: Any) -> tuple[Any, ...]:
-    item = filter_of(rule, numbers, anchors, start)
-    frame = numbers.frame**2 * jnp.eye(2)
-
-    def step(state: Any, row: Any) -> tuple[Any, Any]:
-        after, said = item.correct(item.predict(state, row[1]), row[0])
-        weight = jnp.where(jnp.isnan(row[0]), jnp.nan, 1.0) if said.weight is None else said.weight
-        size = jnp.diagonal(said.covariance)
-        return after, (after.mean[:2], after.covariance[:2, :2] + frame, said.value, size, weight, said.log_likelihood)
-
-    result: tuple[Any, ...] = jax.lax.scan(step, item.init(), (z, u))[1]
-    return result
+    mean = mixed(parts.place)
+    apart = parts.place - mean[:, None]
+    covariance = mixed(parts.covariance + apart[..., :, None] * apart[..., None, :])
+    return Followed(mean, covariance, *(mixed(value) for value in parts[2:]))
 
 
 def line_of(rule: str, numbers: Numbers) -> np.ndarray:
@@ -97,86 +114,81 @@ def line_of(rule: str, numbers: Numbers) -> np.ndarray:
     return np.array(line)
 
 
-def numbers_of(rule: str, line: Any) -> Any:
-    """The way back: all numbers as an array."""
-    values: dict[str, Any] = {}
+def numbers_of(rule: str, line: np.ndarray) -> Numbers:
+    """The way back: all numbers."""
+    values: dict[str, float] = {}
     for name, x in zip(FREE[rule], line, strict=True):
         if name in ("late", "excess"):
-            values[name] = x * (LATENESS if name == "late" else LEVEL)
+            values[name] = float(x * (LATENESS if name == "late" else LEVEL))
         else:
-            values[name] = jax.nn.sigmoid(x) if name == "first" and rule in SHARES else jnp.exp(x)
-    return jnp.stack([jnp.asarray(values.get(name, start)) for name, start in STARTS[rule]._asdict().items()])
+            values[name] = float(expit(x) if name == "first" and rule in SHARES else np.exp(x))
+    return STARTS[rule]._replace(**values)
 
 
 class Padded(NamedTuple):
-    """Drives side by side, short ones ending in slots in which nothing arrives.
+    """Drives side by side, short ones ending in slots in which nothing arrives, and anchors of which nothing does.
 
-    z (drives, slots, anchors), u, time, which slots count, anchors, starts, and the reference's time and places.
+    anchors, start, z (drives, slots, anchors), u, as `followed` takes them.
     """
 
-    z: np.ndarray
-    u: np.ndarray
-    time: np.ndarray
-    used: np.ndarray
     anchors: np.ndarray
     start: np.ndarray
-    truth_time: np.ndarray
-    truth: np.ndarray
+    z: np.ndarray
+    u: np.ndarray
 
 
 def padded(drives: Sequence[Drive]) -> Padded:
-    """The drives of one number of slots."""
-    parts = []
+    """The drives with one number of slots and of anchors."""
     read = [slots(drive) for drive in drives]
     most = -(-max(len(part.time) for part in read) // ROWS) * ROWS
-    points = max(len(drive.truth_time) for drive in drives)
+    count = max(len(drive.places) for drive in drives)
+    parts = []
     for drive, (time, z, u) in zip(drives, read, strict=True):
-        more, later = (0, most - len(time)), (0, points - len(drive.truth_time))
-        used = np.pad((time >= drive.window[0]) & (time <= drive.window[1]), more)
+        later, more = (0, most - len(time)), (0, count - len(drive.places))
         parts.append(
             Padded(
-                np.pad(z, (more, (0, 0)), constant_values=np.nan), np.pad(u, (more, (0, 0))),
-                np.pad(time, more, mode="edge"), used, drive.places, drive.truth[0, :2],
-                np.pad(drive.truth_time, later, mode="edge"),
-                np.pad(drive.truth[:, :2], (later, (0, 0)), mode="edge"),
+                np.pad(drive.places, (more, (0, 0)), mode="edge"), drive.truth[0, :2],
+                np.pad(z, (later, more), constant_values=np.nan), np.pad(u, (later, (0, 0))),
             )
         )  # fmt: skip
     return Padded(*(np.stack(values) for values in zip(*parts, strict=True)))
 
 
-def density(rule: str, line: Any, data: Padded) -> Any:
-    """Mean log density of one drive's true places, the stamps' lateness before each slot."""
-    numbers = numbers_of(rule, line)
-    result = followed(rule, numbers, data.anchors, data.start, data.z, data.u)
-    time = data.time - numbers[Numbers._fields.index("late")]
-    true = jnp.stack([jnp.interp(time, data.truth_time, data.truth[:, i]) for i in (0, 1)], axis=1)
-    e = true - result.place
-    a, b, d = result.covariance[:, 0, 0], result.covariance[:, 0, 1], result.covariance[:, 1, 1]
-    area = a * d - b * b
-    squared = (d * e[:, 0] ** 2 - 2 * b * e[:, 0] * e[:, 1] + a * e[:, 1] ** 2) / area
-    logs = -(squared + jnp.log(area)) / 2 - np.log(2 * np.pi)
-    return jnp.sum(jnp.where(data.used, logs, 0.0)) / jnp.sum(data.used)
+def true_places(drive: Drive, time: np.ndarray) -> np.ndarray:
+    """The reference at these times, (times, 2)."""
+    return np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
 
 
-@partial(jax.jit, static_argnums=0)
-def objective(rule: str, lines: Any, data: Padded) -> Any:
-    """Minus the mean of the drives' densities, at several sets of numbers side by side."""
-    of_drives = jax.vmap(density, (None, None, 0))
-    return -jnp.mean(jax.vmap(lambda line: of_drives(rule, line, data))(lines), axis=1)
+def density(drive: Drive, late: float, place: np.ndarray, covariance: np.ndarray) -> float:
+    """Mean log density of the true places within the window, the stamps' lateness before each slot."""
+    time = slots(drive).time
+    used = np.flatnonzero((time >= drive.window[0]) & (time <= drive.window[1]))
+    e, p = true_places(drive, time[used] - late) - place[used], covariance[used]
+    squared = np.einsum("ti,tij,tj->t", e, np.linalg.inv(p), e)
+    return float(np.mean(-(squared + np.log(np.linalg.det(p))) / 2 - np.log(2 * np.pi)))
 
 
 def learn(rule: str, drives: Sequence[Drive], iterations: int, progress: Callable[[], None] = lambda: None) -> Numbers:
     """The numbers of a rule that these drives teach together; the starting numbers where there is none."""
     if not iterations or not drives:
         return STARTS[rule]
-    data = padded(drives)
-    start = line_of(rule, STARTS[rule])
+    data, start = padded(drives), line_of(rule, STARTS[rule])
+
+    def densities(lines: np.ndarray) -> np.ndarray:
+        """Mean over the drives at each set of numbers, all side by side as runs of one program."""
+        numbers = [numbers_of(rule, line) for line in lines]
+        runs = Padded(*(np.concatenate([x] * len(lines)) for x in data))
+        result = followed(rule, [item for item in numbers for _ in drives], runs)
+        values = [
+            density(drive, numbers[i].late, result.place[k], result.covariance[k])
+            for i in range(len(lines))
+            for k, drive in enumerate(drives, i * len(drives))
+        ]
+        return np.asarray(np.mean(np.reshape(values, (len(lines), len(drives))), axis=1))
 
     def evaluate(line: np.ndarray) -> tuple[float, np.ndarray]:
-        # Central differences, all sets of numbers in one pass: far less than a sweep back through thousands of slots.
         moved = [line, *(line + sign * row for sign in (STEP, -STEP) for row in np.eye(len(line)))]
-        with jax.enable_x64(True):
-            value, *sides = np.asarray(objective(rule, np.stack(moved), data))
+        value, *sides = -densities(np.stack(moved))
         slopes = np.subtract(*np.split(np.array(sides), 2)) / (2 * STEP)
         progress()
         if not np.isfinite(value) or not np.all(np.isfinite(slopes)):
@@ -187,5 +199,4 @@ def learn(rule: str, drives: Sequence[Drive], iterations: int, progress: Callabl
         return float(value) + weight * float(away @ away) / 2, slopes + weight * away / SPREAD
 
     result = minimize(evaluate, start, jac=True, method="L-BFGS-B", options={"maxiter": iterations})
-    with jax.enable_x64(True):
-        return Numbers(*np.asarray(numbers_of(rule, result.x)).tolist())
+    return numbers_of(rule, result.x)

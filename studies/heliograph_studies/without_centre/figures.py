@@ -3,9 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import BLUE, GREEN, INK, VERMILION, Curve
-from heliograph.report.graph_map import graph_map
+from heliograph.report.figures import BLUE, GREEN, INK, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time, graph_map
 from heliograph_studies.without_centre.compute import Outcome
 
 RULES = {"best": ("best weights", GREEN), "intersection": ("intersection", BLUE), "diffusion": ("diffusion", VERMILION)}

@@ -30,7 +30,6 @@ RANGES = {
     "log": [WIDE, NEAR_1, np.linspace(0.01, 4, 20_001)],
     "log1p": [WIDE, NEAR_0[:4001], -NEAR_0[:4000], UNIT[1:]],
     "tanh": [PLAIN, NEAR_0, 10 * PLAIN],
-    "logistic": [PLAIN, np.linspace(-708, 708, 20_001)],
     "sin": [TURNS],
     "cos": [TURNS],
     "tan": [TURNS],
@@ -68,7 +67,6 @@ def _erfc(x: np.ndarray) -> np.ndarray:
 
 TRUE = {
     "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "erf": _erf, "erfc": _erfc,
-    "logistic": lambda x: 1 / (1 + np.exp(-x)),
 }  # fmt: skip
 
 

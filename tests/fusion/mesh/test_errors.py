@@ -206,6 +206,23 @@ def test_frozen_best_weights_claim_what_they_err():
     assert ratio == pytest.approx(np.ones(4), abs=0.1)  # means over 40 and 60 steps of losses
 
 
+def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
+    """A recording takes them for some rows at a time by native code, a run at each step by XLA."""
+    net = network({"d": hg.fusion.DiagonalWeights(), "m": hg.fusion.MatrixWeights()}, link=LINK)
+    for name in ("d", "m"):
+        net = hg.simulation.freeze(net, name, hg.simulation.mesh_arrivals(net, name, 6, 0), last=3)
+    record = hg.monte_carlo(net, 11, 1, 4)
+    monkeypatch.setattr("heliograph.simulation.recorded.ROWS", 4)
+    reports = {f: {n: item.values[0] for n, item in record.reports[f].items()} for f in ("d", "m")}
+    again = hg.run(net, {n: z[0] for n, z in record.measurements.items()}, reports=reports)
+    for node in net.names:
+        for name in ("d", "m"):
+            ours, theirs = again.estimates[node][name], record.estimates[node][name]
+            # Rounding of two compilers over eleven steps.
+            assert ours.mean == pytest.approx(np.asarray(theirs.mean[0]), rel=1e-10, abs=1e-10)
+            assert ours.covariance == pytest.approx(np.asarray(theirs.covariance[0]), rel=1e-10)
+
+
 def test_a_one_way_ring_is_not_starved():
     """Two nodes of opposite sides know a state each: a share by trace alone follows the one that is nearer."""
     names = [f"n{i:02}" for i in range(12)]

@@ -102,7 +102,8 @@ def test_a_step_is_one_program_whatever_the_number_of_nodes():
         rows = {name: ([[1.0, 0.5]], 0.3) for name in names[::2]}
         net = network({"m": hg.fusion.TraceIntersection()}, ring, rows=rows)
         mesh = mesh_of(net, "m")
-        z = tuple(np.zeros((c, 0 if group is None else 1)) for group, c in zip(mesh.groups, mesh.counts, strict=True))
+        model = mesh.observation_model
+        z = tuple(np.zeros((c, 0 if group is None else 1)) for group, c in zip(model.groups, model.counts, strict=True))
         made = jax.make_jaxpr(lambda s: mesh.step(s, z, mesh.edges.lossless(), np.zeros(0), 0)[0])(mesh.init())
         return str(made).count("\n")
 

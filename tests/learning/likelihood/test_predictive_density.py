@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import norm
 
 import heliograph as hg
-from heliograph.learning.likelihood.law_nodes import law_nodes
-from heliograph.learning.likelihood.predictive_density import Parts, of_signals
+from heliograph.learning.likelihood.predictive_density import Parts, law_nodes, of_signals
 from heliograph.random_affine import AbstractLaw
 
 SIGNAL = (np.array([[2.0]]), np.array([[[0.5]]]))

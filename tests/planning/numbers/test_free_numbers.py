@@ -8,8 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.numbers.free_numbers import as_numbers
-from heliograph.planning.numbers.problem import NumberProblem
+from heliograph.planning.numbers.problem import NumberProblem, as_numbers
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))

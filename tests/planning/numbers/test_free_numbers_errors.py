@@ -6,8 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.numbers.free_numbers import as_numbers
-from heliograph.planning.numbers.problem import NumberProblem
+from heliograph.planning.numbers.problem import NumberProblem, as_numbers
 from tests.planning.numbers.test_free_numbers import CASES, FADING, PLANT, check_gradients, observed_modes, uncertain
 
 SENSORS = {"p": hg.LinearSensor([[1.0, 0.0]], 0.2), "q": hg.LinearSensor([[0.0, 1.0]], 0.4)}

@@ -5,8 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.numbers.free_numbers import as_numbers, function_of_numbers
-from heliograph.planning.numbers.problem import NumberProblem
+from heliograph.planning.numbers.problem import NumberProblem, as_numbers, function_of_numbers
 
 PLANT = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0)
 OUTSIDE = {"noise": 0.3}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.planning import Error
-from heliograph.planning.paths.information_filter import Plants, RiccatiMap, adjoint, covariances, fixed_point
+from heliograph.planning.paths.model import Plants, RiccatiMap, adjoint, covariances, fixed_point
 from heliograph.planning.paths.networks import paths_of
 from tests.planning.published import A, Q, path_problem, two_hops
 

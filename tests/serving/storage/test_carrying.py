@@ -10,8 +10,7 @@ import heliograph as hg
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
-from heliograph.serving.storage.carrying import Carrier
-from heliograph.serving.storage.plant_codec import plant_from
+from heliograph.serving.storage.plant_codec import Carrier, plant_from
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 from tests.serving.worlds import fleet as world

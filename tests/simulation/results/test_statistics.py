@@ -1,12 +1,10 @@
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.simulation.results import sums as summing
 from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
 
 
@@ -117,26 +115,6 @@ def test_runs_that_fail_are_counted_and_no_figure_hides_them():
             with pytest.warns(UserWarning, match=f"no valid covariance from step 0 in {above} of 100 runs"):
                 figure()
     assert not outcome["node"]["open"].failure and np.isfinite(outcome["node"]["open"].rmse()[0])
-
-
-def test_steps_summed_a_few_at_a_time_give_the_same_bits(monkeypatch):
-    rng, nodes, runs = np.random.default_rng(0), 3, np.arange(64, 96)
-    mean, spread = rng.normal(size=(2, 32, 6, 1, nodes, 2)), rng.normal(size=(32, 6, 1, nodes, 2, 3))
-    mean[0, 5, 2, 0, 1, 0] = np.nan  # one estimate that is none
-    local = spread @ spread.swapaxes(-1, -2)
-    kinds = tuple(hg.model.Estimate(m, c, "nominal") for m, c in zip(mean, (local, local[:1]), strict=True))
-    batch = {"truth": rng.normal(size=(32, 6, 2)), "estimates": kinds, "fused": {}, "uplinks": {}}
-    results = []
-    for steps in (6, 3, 1):
-        monkeypatch.setattr(summing, "CACHE", steps * 2 * 2 * nodes * 32 * 8)
-        with jax.enable_x64(True):
-            start = hg.Statistics().initial(batch)
-            add = jax.jit(lambda carry, batch: hg.Statistics().reduce(carry, batch, runs, runs < 90)[0])  # traced anew
-            results.append([np.asarray(leaf) for leaf in jax.tree.leaves(add(start, batch))])
-    assert summing._steps_at_once(6, summing.CACHE) == 1
-    for others in results[1:]:
-        for item, other in zip(results[0], others, strict=True):
-            np.testing.assert_array_equal(item, other)
 
 
 def test_a_record_in_single_precision_is_summed_in_double():

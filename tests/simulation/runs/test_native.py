@@ -11,7 +11,7 @@ from heliograph.codegen.graph import Unsupported
 from heliograph.relays.design import own_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
-from heliograph.simulation.results.reducer import AbstractReducer, Trajectories
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import native
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
@@ -206,25 +206,28 @@ def test_covariances_that_no_data_change_are_computed_once():
     assert sum(part is not None for part in result.shared) == 2  # of both filters at the nodes whose links lose nothing
 
 
-class Odd(AbstractReducer):
-    """Keeps nothing, block by block."""
+class Largest(AbstractReducer):
+    """The mean error of each step, and the largest of each run's first state."""
 
-    def initial(self, shapes):
-        return ()
+    def of_step(self, step):
+        error = jnp.abs(step["truth"] - step["estimates"][0].mean[0, 0])
+        return OfStep(sums=error, collected=error[0])
 
-    def reduce(self, carry, batch, runs, valid):
-        return (), ()
+    def summed(self, sums, common, count):
+        return sums.sums.sum(axis=-1) / count.sum()
 
     def finish(self, carry, collected, network):
-        return "done"
+        return carry, collected.max(axis=1)
 
 
-def test_a_reducer_of_blocks_is_computed_by_xla(monkeypatch):
-    network = shadowed()
-    assert hg.monte_carlo(network, 3, 2, 0, Odd()) == "done"
-    monkeypatch.setenv(SETTING, "native")
-    with pytest.raises(ValueError, match="Odd, which has no of_step"):
-        hg.monte_carlo(network, 3, 2, 0, Odd())
+def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
+    network, results = shadowed(), {}
+    for engine in ("native", "xla"):
+        monkeypatch.setenv(SETTING, engine)
+        results[engine] = hg.monte_carlo(network, 3, 35, 0, Largest())
+    for native_part, other in zip(*results.values(), strict=True):
+        np.testing.assert_allclose(native_part, other, rtol=0, atol=1e-13)
+    assert [len(part) for part in results["xla"]] == [3, 35]
 
 
 def test_keys_of_another_hash_are_simulated_by_xla():

@@ -28,7 +28,8 @@ class Code(NamedTuple):
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
     `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
-    program; a block executes `work` of them, with each turn of its loops.
+    program, `divisions` those of them that divide or take roots; a block executes `work` of them, with each turn of its
+    loops.
     """
 
     blocks: str
@@ -40,6 +41,7 @@ class Code(NamedTuple):
     shared: int
     scratch: int
     operations: int
+    divisions: int
     work: int
 
 
@@ -96,6 +98,7 @@ def written(
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = needed(outputs)
     operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
+    divisions = sum(isinstance(x, Node) and x.op in ("div", "sqrt") for x in items)
     if operations > LONGEST:
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
     # Numbers that differ between runs; all others are computed once.
@@ -137,7 +140,9 @@ def written(
         once = _with_functions(_once(writer, program, pointers, in_shared), writer)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, _work(mine))
+    return Code(
+        text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, divisions, _work(mine)
+    )
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:

@@ -50,13 +50,16 @@ def _over(
         results = zip(_single(lowering, equation, inputs), shapes, strict=True)
         return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
     count, rest = runs[-1], runs[:-1]
+    # A few are written out.
     if count <= FEW:
         items = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
         return [_together(lowering, list(results)) for results in zip(*items, strict=True)]
-    rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
+    # Of many, a loop takes apart what differs between them; what they share stays whole.
+    differs = [x.shape[-1] > 1 for x in inputs]
+    rows = [in_memory(lowering, x) if d else _run(x, 0) for x, d in zip(inputs, differs, strict=True)]
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        item = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
+        item = [_run(x, place) if d else x for x, d in zip(rows, differs, strict=True)]
         return [], [lowering.nodes(x) for x in _over(lowering, equation, item, rest, shapes)]
 
     stacked = repeated(lowering, count, [], turn)[1]

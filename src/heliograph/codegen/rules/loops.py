@@ -7,7 +7,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.graph import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
-from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of
+from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.rules.elementwise import select
 
@@ -25,7 +25,7 @@ def repeated(
     """
     graph, outer = lowering.graph, lowering.graph.current
     body = Block(outer)
-    loop = Loop(body, length, [n for x in carry for n in words(x)])
+    loop = Loop(body, length, [n for x in carry for n in scalars(x)])
     loop.counter = counter = graph.fresh("counter", "i64", (), body, loop)
     # In the body the carry is a parameter; the turn is traced once.
     loop.parameters = [
@@ -34,7 +34,7 @@ def repeated(
     graph.current = body
     place = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
     following, stacked = turn(place, _like(carry, loop.parameters))
-    loop.following = [n for x in following for n in words(x)]
+    loop.following = [n for x in following for n in scalars(x)]
     memory = [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
     graph.current = outer
     outer.items.append(loop)
@@ -55,12 +55,6 @@ def _stack(
     for entry, node in enumerate(flat):
         lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
     return InMemory.whole(buffer)
-
-
-def words(value: np.ndarray) -> list[Node]:
-    """Return the nodes of an array in row-major order, a key as its two words."""
-    flat: list[Any] = value.ravel().tolist()
-    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
 
 
 def _numbers(value: np.ndarray) -> list[Node]:
@@ -161,7 +155,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
     carry = [lowering.nodes(x) for x in inputs[conditional + fixed :]]
     body = Block(outer)
-    loop = Loop(body, None, [n for x in carry for n in words(x)])
+    loop = Loop(body, None, [n for x in carry for n in scalars(x)])
     loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
     graph.current = body
     now = _like(carry, loop.parameters)
@@ -169,7 +163,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
     body.items.append(Check(loop))
     results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
-    moved = [n for x in results for n in words(x)]
+    moved = [n for x in results for n in scalars(x)]
     loop.following = [select(graph, active, new, old) for new, old in zip(moved, loop.parameters, strict=True)]
     graph.current = outer
     outer.items.append(loop)

@@ -18,6 +18,7 @@ from heliograph.codegen.graph import Graph, Key, Node, Unsupported
 from heliograph.codegen.lowering import RULES, Lowering, array_of, keys_of, result_shape
 from heliograph.codegen.rules.elementwise import broadcast
 
+Word = Any  # of 32 bits, in an integer or an array of wider ones
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 PARITY = 0x1BD11BDA
 
@@ -132,8 +133,8 @@ RULES |= {
 }  # fmt: skip
 
 
-def hashed(first: int, second: int, high: int, low: int) -> int:
-    """Hash known words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
+def hashed(first: Word, second: Word, high: Word, low: Word) -> Word:
+    """Hash words: 20 rounds of addition, rotation and exclusive or; key words are added every four rounds."""
     keys = (first, second, first ^ second ^ PARITY)
     x, y, mask = (high + first) & 0xFFFFFFFF, (low + second) & 0xFFFFFFFF, 0xFFFFFFFF
     for four in range(5):

@@ -43,13 +43,6 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
     return _limited(x, _scaled(item + ((1 - item + r) + small), count), 709.782712893384, -745.1332191019412)
 
 
-def exp2(x: Vector) -> Vector:
-    """2^x = 2^n e^(ln(2) (x - n)); the difference is exact."""
-    count, n = _nearest(x)
-    r = (x - n) * math.log(2)
-    return _limited(x, _scaled(1 + fma(r * r, polynomial(r, EXP), r), count), 1023.9999999999999, -1075.0)
-
-
 def expm1(x: Vector) -> Vector:
     """e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
     count, n = _nearest(select(x < -50.0, -50.0, x) * LOG2_E)
@@ -85,11 +78,6 @@ def tanh(x: Vector) -> Vector:
     t = expm1(select(large, 2 * size, -2 * size))
     ratio = select(large, -2.0, t) / (2 + t)
     return copy_sign(select(large, 1 + ratio, ratio), x)
-
-
-def logistic(x: Vector) -> Vector:
-    """1 / (1 + e^-x)."""
-    return 1 / (1 + exp(-x))
 
 
 def _nearest(x: Vector) -> tuple[Vector, Vector]:

@@ -112,10 +112,6 @@ class Vector:
         """Reinterpret the bits as another type."""
         return self.body.add(scalar, f"bitcast {self.type} {self.name} to {self.body.type(scalar)}")
 
-    def convert(self, how: str, scalar: str) -> "Vector":
-        """Convert by an instruction such as "zext" or "trunc"."""
-        return self.body.add(scalar, f"{how} {self.type} {self.name} to {self.body.type(scalar)}")
-
 
 def constant(body: Body, scalar: str, value: float) -> Vector:
     """Return a vector of one number."""

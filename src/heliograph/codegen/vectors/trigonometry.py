@@ -1,9 +1,9 @@
-"""Sine, cosine and their inverses on vectors."""
+"""Sine, cosine and the angle of a vector, on vectors of numbers."""
 
 import math
 
 from heliograph.codegen.vectors.exponential import _nearest
-from heliograph.codegen.vectors.formulas import Vector, copy_sign, fma, polynomial, select, sqrt
+from heliograph.codegen.vectors.formulas import Vector, copy_sign, fma, polynomial, select
 
 HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
 LARGEST = 2.0**20  # up to which the sum above is long enough; beyond, the scalar library is called
@@ -44,21 +44,6 @@ TURNS = [
     (19 / 16, (1.0, -1.5, 1.5, 1.0), 9.82793723247329054082e-01, 1.39033110312309984516e-17),
     (39 / 16, (0.0, -1.0, 1.0, 0.0), 1.57079632679489655800e00, 6.12323399573676603587e-17),
 ]
-ASIN = [
-    1.66666666666666657415e-01,
-    -3.25565818622400915405e-01,
-    2.01212532134862925881e-01,
-    -4.00555345006794114027e-02,
-    7.91534994289814532176e-04,
-    3.47933107596021167570e-05,
-]
-ASIN_BELOW = [
-    1.0,
-    -2.40339491173441421878e00,
-    2.02094576023350569471e00,
-    -6.88283971605453293030e-01,
-    7.70381505559019352791e-02,
-]
 
 
 def sin(x: Vector) -> Vector:
@@ -75,15 +60,6 @@ def cos(x: Vector) -> Vector:
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
     value = select(((quarter + 1) & 2).equals(0), value, -value)
     return _of_any_size(x, value, "cos")
-
-
-def tan(x: Vector) -> Vector:
-    """Sine over cosine."""
-    quarter, r, low = _turned(x)
-    s, c = _sin(r, low), _cos(r, low)
-    even = (quarter & 1).equals(0)
-    value = select(even, s, -c) / select(even, c, s)
-    return _of_any_size(x, select(abs(x) < 2.0**-27, x, value), "tan")
 
 
 def _turned(x: Vector) -> tuple[Vector, Vector, Vector]:
@@ -156,35 +132,3 @@ def atan2(y: Vector, x: Vector) -> Vector:
 
 def _is_number(x: Vector) -> Vector:
     return x.equals(x)
-
-
-def asin(x: Vector) -> Vector:
-    """Arcus sine: a rational function up to 1/2; beyond, pi/2 - 2 asin(sqrt((1 - x) / 2))."""
-    size = abs(x)
-    inner, s, ratio, rest = _asin_parts(size)
-    small = fma(s, ratio, s)
-    large = HALF_PI[0] - (2 * (s + (s * ratio + rest)) - HALF_PI[1])
-    return copy_sign(select(inner, small, large), x)
-
-
-def acos(x: Vector) -> Vector:
-    """Arcus cosine: pi/2 - asin(x); beyond 1/2, 2 asin(sqrt((1 - x) / 2))."""
-    size = abs(x)
-    inner, s, ratio, rest = _asin_parts(size)
-    signed = copy_sign(s, x)
-    near = HALF_PI[0] - (signed - (HALF_PI[1] - signed * ratio))
-    end = 2 * (s + (s * ratio + rest))
-    other = math.pi - (end - 1.2246467991473531772e-16)
-    return select(inner, near, select(x > 0.0, end, other))
-
-
-def _asin_parts(size: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return whether |x| < 1/2; s and ratio with asin s = s + s ratio; and the rounding error of s."""
-    inner = size < 0.5
-    z = select(inner, size * size, (1 - size) * 0.5)
-    root = sqrt(z)
-    s = select(inner, size, root)
-    ratio = z * polynomial(z, ASIN) / polynomial(z, ASIN_BELOW)
-    # sqrt(z) = root + (z - root^2) / (2 root), one Newton step.
-    rest = fma(-root, root, z) / (2 * root)
-    return inner, s, ratio, select(root.equals(0.0), 0.0, rest)

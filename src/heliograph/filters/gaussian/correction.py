@@ -139,7 +139,8 @@ def _rounding(signal: Signal, channel: SecondOrder) -> jax.Array:
     through = jnp.abs(channel.mean_gain)
     of_mean = jnp.zeros_like(signal.mean) if signal.rounding is None else signal.rounding
     count = signal.second.shape[0]
-    variances = transpose(diagonal_of(jnp.moveaxis(jnp.asarray(diagonal_of(channel.spread.center)), 0, 2)))
+    center = jnp.asarray(channel.spread.center)
+    variances = transpose(diagonal_of(jnp.moveaxis(diagonal_of(center), 0, 2)))
     unit = 100 * count * float(np.finfo(of_mean.dtype).eps)
     return times_vector(through, of_mean) ** 2 + unit * times_vector(variances[:, :count], diagonal_of(signal.second))
 

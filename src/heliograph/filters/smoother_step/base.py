@@ -125,11 +125,6 @@ class AbstractSmootherStep(Module):
         nothing = jnp.zeros_like(self.covariance)
         return Point(self.mean, self.covariance, unit, nothing, self.covariance, jnp.asarray(False))
 
-    def without_data(self) -> Self:
-        """Return the same step without the parts that only means depend on."""
-        none = jnp.zeros_like(self.mean)
-        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
-
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:
         """Return the same step with other data of the same arrivals: other means and innovation."""
         return replace(self, mean=mean, prior_mean=prior_mean)
@@ -240,10 +235,6 @@ class LinearSmootherStep(AbstractSmootherStep):
         step = item.covariance, self.transition, self.prior_covariance, earlier.precise
         mean = _mean_before(item.mean, earlier.vector, known.mean - self.prior_mean, *step)
         return Moments(mean, _left(earlier.matrix, self.process, known.covariance, *step))
-
-    def without_data(self) -> Self:
-        """Return the step without means and innovation."""
-        return replace(super().without_data(), innovation=jnp.zeros_like(self.innovation))
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:
         """Return the step with these means and innovation."""

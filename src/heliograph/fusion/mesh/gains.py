@@ -38,11 +38,12 @@ class Believed(NamedTuple):
 class Weights(NamedTuple):
     """Weights C_j = front parts_j of the neighbours' estimates, and the covariance Pc of what is fused.
 
-    Shapes: front (n, n), parts (degree, n, n), covariance (n, n). Two factors, since intersections share the first.
+    Shapes: front (n, n), parts (degree, n, n) or their diagonals (degree, n), covariance (n, n). Two factors, since
+    intersections share the first.
     """
 
     front: Float[jax.Array, "n n"]
-    parts: Float[jax.Array, "degree n n"]
+    parts: Float[jax.Array, "degree n *n"]
     covariance: Float[jax.Array, "n n"]
 
 
@@ -58,11 +59,11 @@ class Step(NamedTuple):
 class Gains(NamedTuple):
     """Gains of one node's step: M_j = front parts_j, of others than itself; W and F = I - W S; P.
 
-    Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n).
+    Shapes: front, gain, innovation and covariance (n, n), parts (degree, n, n) or their diagonals (degree, n).
     """
 
     front: Float[jax.Array, "n n"]
-    parts: Float[jax.Array, "degree n n"]
+    parts: Float[jax.Array, "degree n *n"]
     gain: Float[jax.Array, "n n"]
     innovation: Float[jax.Array, "n n"]
     covariance: Float[jax.Array, "n n"]

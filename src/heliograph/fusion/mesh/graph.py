@@ -147,20 +147,13 @@ def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
 
     Nodes of one strongly connected component share them.
     """
-    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse.csgraph import breadth_first_order, connected_components
 
     reach = graph.reach()
     count, label = connected_components(reach, connection="strong")
-    members = [np.flatnonzero(label == c) for c in range(count)]
     # Components that a component receives from, over all paths: a row of the reach is one of receivers.
-    direct = [set(label[reach[rows].indices].tolist()) for rows in members]
-    behind: list[set[int]] = []
-    for c in range(count):
-        seen, ahead = {c}, [c]
-        while ahead:
-            new = direct[ahead.pop()] - seen
-            seen |= new
-            ahead += new
-        behind.append(seen)
-    places = [np.sort(np.concatenate([members[c] for c in seen])) for seen in behind]
+    receivers, senders = reach.nonzero()
+    between = csr_array((np.ones(len(senders)), (label[receivers], label[senders])), shape=(count, count))
+    behind = [breadth_first_order(between, c, return_predecessors=False) for c in range(count)]
+    places = [np.flatnonzero(np.isin(label, seen)) for seen in behind]
     return [places[c] for c in label]

@@ -3,23 +3,26 @@
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.intersection import inverses, without_known
+from heliograph.codegen.engine import chosen
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.mesh.shares import intersection_weights, trace_shares
-from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
-from heliograph.model.estimate import Claim, weakest
+from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances
+from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, scalar, table
 from heliograph.numerics.linalg import symmetrize
-from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+
+Ahead = tuple[np.ndarray, np.ndarray]  # parts (step, row, ...) and covariances (step, row, n, n) of weights
 
 SUM = 1e-9  # shares are decimal fractions, whose sum is 1 up to rounding
 
 
-class TraceIntersection(AbstractFusion):
+class TraceIntersection(AbstractIntersection):
     """Covariance intersection with shares from the traces: proportional to (tr P_j)^-power, or equal.
 
     Of the two the one whose fused covariance has the smaller trace: shares by trace alone ignore a neighbour of large
@@ -41,27 +44,24 @@ class TraceIntersection(AbstractFusion):
         self.power = float(scalar("power of the traces", power, 0.0))
         self.improvements = check_count("improvements", improvements, 0)
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
-        if "none" in claims:
-            raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
-        return weakest([*claims, "upper"])
-
-    def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Intersect all of several estimates."""
-        information = inverses(covariances)
-        traces = jnp.trace(covariances, axis1=1, axis2=2)
-        believed = Believed(covariances[0], traces, information, None, jnp.ones(len(means), dtype=bool))
-        front, parts, covariance = self.neighbour_weights(believed)
-        off = jnp.einsum("jab,jb->a", parts, means - means[0])
-        return means[0] + front @ off, without_known(covariance, covariances)
+    def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
+        """Shares of all of several estimates."""
+        traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
+        believed = Believed(covariances[0], traces, information, None, all_there)
+        return trace_shares(believed, self.power, self.improvements)[0]
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Intersect what arrived."""
         return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
 
 
-class DiffusionWeights(AbstractFusion):
+class _OfNeighbours(AbstractFusion):
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: a fusion centre has no neighbours."""
+        raise fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+
+
+class DiffusionWeights(_OfNeighbours):
     """Fixed shares c_ij of the neighbours' estimates: diffusion, whose gains do not depend on what arrives.
 
     xhat_i+ = A xhat_i + sum_j c_ij F_i A (xhat_j - xhat_i) + sum_j K_ij (z_j - H_j A xhat_i) over what arrived, with
@@ -93,31 +93,20 @@ class DiffusionWeights(AbstractFusion):
         """Always True: the claim is the joint covariance's."""
         return True
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Refused: a fusion centre has no neighbours."""
-        raise fail("fusion by DiffusionWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
-
     def placed(self, graph: Graph) -> "DiffusionWeights":
         """Return the rule with its shares (degree, row) of the graph's rows, zero for the node itself."""
         result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
-        if self.given is not None:
-            result = np.array([self._row(graph, i) for i in range(len(graph.senders))])
+        for i, senders in enumerate(graph.senders if self.given is not None else ()):
+            name, *others = (graph.nodes[j] for j in senders[graph.present[i]])
+            mine = (self.given or {}).get(name, {})
+            if unknown := sorted(set(mine) - {name, *others}):
+                raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(others)}", unknown)
+            result[i, 1 : 1 + len(others)] = [mine.get(other, 0.0) for other in others]
         result[:, 0] = 0.0
         placed: DiffusionWeights = eqx.tree_at(
             lambda r: (r.shares, r.given), self, (result.T, None), is_leaf=lambda leaf: leaf is None
         )
         return placed
-
-    def _row(self, graph: Graph, i: int) -> list[float]:
-        """Shares of node i in the graph's order."""
-        given = self.given or {}
-        name = graph.nodes[graph.senders[i, 0]]
-        mine = {n: share for n, share in given.get(name, {}).items() if n != name}
-        names = [graph.nodes[j] for j in graph.senders[i]]
-        known = {n for n, there in zip(names, graph.present[i], strict=True) if there}
-        if unknown := sorted(set(mine) - known):
-            raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(known - {name})}", unknown)
-        return [mine.get(n, 0.0) if there else 0.0 for n, there in zip(names, graph.present[i], strict=True)]
 
     def neighbour_gains(self, believed: Believed, step: Step) -> Gains:
         """Gains of a filter with all neighbours' measurements; each estimate's share where it arrived."""
@@ -128,10 +117,10 @@ class DiffusionWeights(AbstractFusion):
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
         # What arrived alone corrects.
         used = jnp.eye(len(a)) - corrected @ step.arrived
-        return Gains(innovation @ a, shares[:, None, None] * jnp.eye(len(a)), corrected, used, corrected)
+        return Gains(innovation @ a, shares[:, None] * jnp.ones(len(a)), corrected, used, corrected)
 
 
-class FrozenWeights(AbstractFusion):
+class FrozenWeights(_OfNeighbours):
     """Best weights for joint covariances of each neighbourhood that do not move: means over losses in the steady state.
 
     `freeze` makes it. Weights are solved for what arrived at each step, from these blocks alone.
@@ -146,10 +135,6 @@ class FrozenWeights(AbstractFusion):
     rule: AbstractFusion
     blocks: Float[Array, "..."]
 
-    def claim(self, claims: list[Claim]) -> Claim:
-        """Refused: a fusion centre has no neighbours."""
-        raise fail("fusion by FrozenWeights", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
-
     def placed(self, graph: Graph) -> "FrozenWeights":
         """Return the rule with the blocks (degree, n, degree, n, row) of the graph's rows."""
         width = graph.senders.shape[1]
@@ -162,6 +147,30 @@ class FrozenWeights(AbstractFusion):
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of what arrived, and the covariance that the blocks give them."""
         return self.rule.neighbour_weights(believed._replace(joint=jnp.asarray(self.blocks)))
+
+    def weights_ahead(self, arrived: Bool[np.ndarray, "step row degree"]) -> Ahead | None:
+        """Weights of many steps by native code, parts and covariances (step, row, ...); None where it takes none.
+
+        They depend on what arrives at a step alone, so that a node's blocks are read once for all of them.
+        """
+        rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
+        with jax.enable_x64(True):
+            code = chosen(_weights_of_row, (self.rule, *rows), (False, True, True))
+            return None if code.code is None else jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), code.results())
+
+
+def _weights_of_row(
+    rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
+) -> tuple[jax.Array, jax.Array]:
+    """Parts and covariances (step, ...) of one node's weights."""
+    degree, n = joint.shape[:2]
+    nothing = Believed(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
+
+    def body(_: None, present: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
+        weights = rule.neighbour_weights(nothing._replace(present=present))
+        return None, (weights.parts, weights.covariance)
+
+    return jax.lax.scan(body, None, arrived)[1]
 
 
 def _checked(name: str, row: object) -> dict[str, float]:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.intersection import inverse
-from heliograph.numerics.linalg import add, diagonal_of, factor, identity, minus, regular_solve, symmetric
+from heliograph.numerics.linalg import add, diagonal_of, identity, regular_solve, symmetric, written_solver
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Bool, Float
 
@@ -36,20 +36,7 @@ def arrived_weights(
     return unit[:, None, None] * weights / unit
 
 
-def _solved(a: Float[jax.Array, "n n ..."], b: Float[jax.Array, "n ..."]) -> Float[jax.Array, "n ..."]:
-    """A^-1 B of a regular A by its Cholesky factor, written out."""
-    columns, scales = factor(a)
-    n = len(a)
-    forward: list[jax.Array] = []
-    for i in range(n):  # L Y = B
-        forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
-    backward = forward[:]
-    for i in reversed(range(n)):  # L' X = Y
-        backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
-    return jnp.stack(backward)
-
-
-_short_solve = runs_last(_solved)
+_short_solve = runs_last(lambda a, b: written_solver(a)(b))
 
 
 def arrived_weights_by_component(
@@ -83,7 +70,7 @@ def component_weights(
     mean = jnp.sum(there * diagonal_of(component) / jnp.sum(there, axis=0), axis=0)
     apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
     total = there[:, None] * there * component + identity(degree, component) * apart[:, None]
-    solved = _solved(total, there * jnp.ones_like(mean))
+    solved = written_solver(total)(there * jnp.ones_like(mean))
     return solved / jnp.sum(solved, axis=0)
 
 

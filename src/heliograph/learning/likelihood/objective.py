@@ -1,8 +1,8 @@
 """Objective of a fit: the likelihood of all nodes together as a function of the free numbers, scores, information."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,20 +13,22 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.linear import linear_filter
-from heliograph.filters.rows import over_rows
+from heliograph.filters.rows import over_rows, rows
 from heliograph.learning.description import Description
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.enlarged import joint_sensor
+from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
-from heliograph.numerics.check import fail
+from heliograph.numerics.angle import nearest
+from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import solve
 from heliograph.numerics.module import same
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
 from heliograph.random_affine.noise import Independent
@@ -70,18 +72,20 @@ def _joint_channel(channel: Channel) -> Channel:
     return result
 
 
-Form = Literal["linear", "conditional"]
+Form = Literal["linear", "conditional", "truth"]
 
 
 class Data(NamedTuple):
     """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
 
-    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,).
+    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
+    truth (recordings, steps, n), the true states where these are learned from, NaN where they are not known.
     """
 
     measurements: Float[np.ndarray, "recordings steps received"]
     inputs: Float[np.ndarray, "recordings steps inputs"]
     lengths: tuple[int, ...]
+    truth: Float[np.ndarray, "recordings steps n"] | None = None
 
 
 class Evaluation(NamedTuple):
@@ -124,7 +128,7 @@ class Objective:
 
     Args:
         description: the network with its free numbers.
-        form: "linear" or "conditional".
+        form: "linear" or "conditional", the measurements' likelihood; "truth", the density of the true states.
     """
 
     description: Description
@@ -150,9 +154,20 @@ class Objective:
         )
         return result
 
+    def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
+        """Errors of the estimates (steps, n), NaN where the truth is not known, and what is claimed (steps, n, n)."""
+        item, angles = self.filter(x), first(self.description.start.plant).angles
 
-def objectives(network: Description) -> list[Objective]:
-    """Objectives that the network allows, the linear one first.
+        def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            estimate = item.estimate(state)
+            return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
+
+        mean, covariance = over_rows(item, z, u, claimed)
+        return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
+
+
+def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
+    """Objectives that the network allows, the linear one first; `by_truth` the density of the true states alone.
 
     Linear: the spread of a random gain by the state's unconditional moments, for linear plants; its score has mean zero
     whatever the laws. Conditional: by the state's moments given data, for channels without memory or delay. Without a
@@ -161,6 +176,9 @@ def objectives(network: Description) -> list[Objective]:
     Raises:
         ValueError: a network whose likelihood no filter here knows.
     """
+    if by_truth:
+        sole_filter(network.start)
+        return [Objective(network, "truth")]
     return [Objective(network, form) for form in forms_of(network.start)]
 
 
@@ -179,32 +197,57 @@ def forms_of(network: Network) -> list[Form]:
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
-    """Filter of all that the network's nodes receive, whose likelihood is of this form."""
+    """Filter of all that the network's nodes receive, whose likelihood is of this form; "truth": the network's own."""
+    if form == "truth":
+        return sole_filter(network)
     plant, sensor, channel = joint_world(network)
     if form == "linear":
         return linear_filter(plant, sensor, channel)
     return cubature_filter(plant, sensor, without_memory(channel))
 
 
+def sole_filter(network: Network) -> AbstractFilter:
+    """Only filter of a network, of all that arrives and of all states.
+
+    Raises:
+        ValueError: none, several, one of a part of the states, or one that claims no covariance.
+    """
+    nodes = list(network.nodes.values())
+    local = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
+    items = [*local.values(), *(item for item in network.fused.values() if isinstance(item, AbstractFilter))]
+    if len(items) != 1 or items[0].states != network.states:
+        expected = "one filter, of all that arrives, whose estimates are compared with them"
+        raise fail("network to be learned by its true states", expected, len(items) or "none")
+    if items[0].claim == "none":
+        raise fail("filter to be learned by true states", "one that claims a covariance", "one that claims none")
+    return items[0]
+
+
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
-    """Likelihood, scores and information at points of the line: native code, all points side by side, or XLA."""
+    """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
+    data_rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
+    count, copies = len(data.measurements), (len(x), 1, 1)
+    runs = np.repeat(x, count, axis=0), *(np.tile(part, copies) for part in data_rows)
     with jax.enable_x64(True):
-        parts = [_at_points(objective, x, z, u) for z, u in zip(data.measurements, data.inputs, strict=True)]
-    density, score, halves = zip(*parts, strict=True)
-    return Evaluation(np.stack(density, axis=1), np.stack(score, axis=1), np.sum(halves, axis=0))
+        choice = chosen(one_recording, (objective, *runs), [False, *(True for _ in runs)])
+        if choice.code is not None:
+            results = choice.results()
+        else:
+            parts = [to_numpy(_by_xla(objective, *run)) for run in zip(*runs, strict=True)]
+            results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
+    return Evaluation(density, score, halves.sum(axis=1))
 
 
-def _at_points(objective: Objective, x: np.ndarray, z: np.ndarray, u: np.ndarray) -> Evaluation:
-    """Evaluate one recording at points, (points, ...)."""
-    choice = chosen(one_recording, (objective, x, z, u), [False, True, False, False])
-    if choice.code is not None:
-        return choice.results()  # type: ignore[no-any-return]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *(to_numpy(_by_xla(objective, point, z, u)) for point in x))  # type: ignore[no-any-return]
+def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
+    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward.
 
+    With the true states e is the error of the estimates and S what they claim.
+    """
 
-def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
-    """Evaluate one recording: density (steps,), score (steps, p) and information (2, p, p); derivatives run forward."""
-    local = partial(objective.innovations, z=z, u=u)
+    def local(x: Array) -> tuple[jax.Array, jax.Array]:
+        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
+
     (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 1))(jnp.eye(len(x)))
 
     def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -213,7 +256,7 @@ def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluat
         late = jnp.stack([k < len(z) // 2, k >= len(z) // 2])[:, None, None]
         return halves + jnp.where(late, information, 0.0), (density, score)
 
-    rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z)
+    rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z if truth is None else truth)
     halves, (density, score) = jax.lax.scan(step, jnp.zeros((2, len(x), len(x))), rows)
     return Evaluation(density, score, halves)
 
@@ -239,3 +282,115 @@ def _scored(
     w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m)
     score = -de @ w - jnp.einsum("iai->a", q) / 2 + jnp.einsum("i,aij,j->a", w, ds, w) / 2
     return density, score, de @ v + jnp.einsum("iaj,jbi->ab", q, q) / 2
+
+
+FEWEST = 10  # numbers that arrived for each free one
+
+
+def gathered(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
+    """Gather all recordings, checked against the network, as `Data`; with true states where these are asked for.
+
+    Raises:
+        ValueError: recordings of other shapes, too short, or without any change.
+    """
+    several = (
+        recording if isinstance(recording, list | tuple) and not hasattr(recording, "measurements") else [recording]
+    )
+    if not len(several):
+        raise fail("recordings", "at least one", "none")
+    # every run of every recording, then all filled up to the longest
+    parts = [part for i, item in enumerate(several) for part in _parts(network, item, _inputs_of(inputs, i, several))]
+    for z, _ in parts:
+        network.check_horizon(len(z))
+    longest = max(len(z) for z, _ in parts)
+    true = [] if truth is False else _truths(network, several, truth, [len(z) for z, _ in parts])
+    data = Data(
+        np.stack([_filled(z, longest, np.nan) for z, _ in parts]),
+        np.stack([_filled(u, longest, None) for _, u in parts]),
+        tuple(len(z) for z, _ in parts),
+        np.stack([_filled(x, longest, np.nan) for x in true]) if true else None,
+    )
+    _check_enough(data, free)
+    return data
+
+
+def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
+    if not isinstance(inputs, list | tuple):
+        return inputs
+    if len(inputs) != len(several):
+        raise fail("inputs", f"those of each of the {len(several)} recordings", f"{len(inputs)} of them")
+    return inputs[index]
+
+
+def _truths(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
+    """True states (steps, n) of each run of each recording, NaN where they are not known.
+
+    Raises:
+        ValueError: recordings without them, other shapes.
+    """
+    held = [getattr(item, "truth", None) for item in several] if truth is True else truth
+    listed = held if isinstance(held, list | tuple) and len(held) == len(several) else [held]
+    if len(listed) != len(several) or any(item is None for item in listed):
+        got = "none" if truth is True else f"{len(listed)} of them"
+        raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
+    runs = [run for item in map(np.asarray, listed) for run in (item if item.ndim == 3 else [item])]
+    if len(runs) != len(steps):
+        raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
+    return [array("truth", run, (count, len(network.states)), missing=True)
+            for run, count in zip(runs, steps, strict=True)]  # fmt: skip
+
+
+def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
+    held = getattr(recording, "measurements", recording)
+    local = getattr(recording, "inputs", None) if inputs is None else inputs
+    # measurements by node
+    if not isinstance(held, Mapping):
+        if len(network.names) > 1:
+            raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
+        held = {network.names[0]: held}
+    if set(held) != set(network.names):
+        raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
+    # each run: the nodes' columns side by side, and the inputs
+    runs = _runs([np.asarray(held[name]) for name in network.names])
+    results = []
+    for run in runs:
+        columns: list[np.ndarray] = []
+        for name, z in zip(network.names, run, strict=True):
+            like = len(columns[0]) if columns else None
+            found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(found_rows))
+        steps, count = len(columns[0]), len(network.inputs)
+        if local is None and count:
+            raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
+        u = np.zeros((steps, 0)) if local is None else rows("inputs", local, steps, count, missing=False)
+        results.append((np.concatenate(columns, axis=1), np.asarray(u)))
+    return results
+
+
+def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
+    """Runs of a simulation one by one; a recording is one."""
+    if all(value.ndim == 3 for value in values):
+        return [list(item) for item in zip(*values, strict=True)]
+    return [values]
+
+
+def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
+    """Array with rows added up to a length: of a filler, or copies of the last one."""
+    more = length - len(values)
+    end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
+    return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values
+
+
+def _check_enough(data: Data, free: int) -> None:
+    z = data.measurements if data.truth is None else data.truth
+    count = int(np.count_nonzero(~np.isnan(z)))
+    if count < FEWEST * free:
+        known = "that arrived" if data.truth is None else "of the truth"
+        raise fail("recording", f"at least {FEWEST * free} numbers {known} for {free} free ones", count)
+    z = data.measurements
+    flat = z.reshape(-1, z.shape[-1])
+    received = [column[~np.isnan(column)] for column in flat.T]
+    still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
+    if len(still) == sum(len(column) > 0 for column in received):
+        raise fail("recording", "measurements that vary", f"{array('m', received[still[0]], (None,))[0]:g} throughout")

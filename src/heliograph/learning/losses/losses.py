@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from scipy.special import expit, xlogy
 from scipy.stats import chi2, norm
 
-from heliograph.learning.long_run import mean_and_error
+from heliograph.learning.intervals import mean_and_error
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at

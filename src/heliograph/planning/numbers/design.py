@@ -9,8 +9,7 @@ from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
 from heliograph.planning.budget import PowerLimits, as_budget, power_limits, unlimited
 from heliograph.planning.descent import ACTIVE, Limits, Problem, Programme, Vector, search
-from heliograph.planning.numbers.free_numbers import Build, function_of_numbers
-from heliograph.planning.numbers.problem import NumberProblem
+from heliograph.planning.numbers.problem import Build, NumberProblem, function_of_numbers
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.realised import repeated
 

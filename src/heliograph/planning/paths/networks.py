@@ -11,8 +11,7 @@ from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
-from heliograph.planning.paths.information_filter import Plants
-from heliograph.planning.paths.model import Paths
+from heliograph.planning.paths.model import Paths, Plants
 from heliograph.planning.transmitters import sent_powers, transmits
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.columns import columns_of
 from heliograph.files.events import holds_events, read_events
 from heliograph.files.recording import TIME_STEP, read_recording
+from heliograph.files.table import columns_of
 from heliograph.live.event import INPUTS, Event
 from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar
 from heliograph.simulation.network import Network

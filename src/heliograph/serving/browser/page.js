@@ -93,6 +93,7 @@ function show(view) {
   charts(view);
   links(view);
   tests(view);
+  outputs(view);
 }
 
 function keys(view) {
@@ -226,6 +227,13 @@ function tests(view) {
   at("tests").replaceChildren(...rows.map((test) => row(test.node + "/" + test.filter, [test.claim, ...(test.by.length
     ? [made("td", test.doubt ? "doubtful" : "holds", test.doubt ? "doubt" : "fine"), "by " + listed(test.by)]
     : [made("td", test.ratio < 0.1 || test.ratio > 99 ? short(test.ratio, 2) : test.ratio.toFixed(2), test.doubt ? "doubt" : "fine"), short(test.low, 2) + " to " + short(test.high, 3)])])));
+}
+
+function outputs(view) {
+  at("weighed").hidden = !view.outputs.length;
+  const two = (value) => value === null ? "" : value.toFixed(2);
+  at("outputs").replaceChildren(...view.outputs.map((one) => row(one.output, [one.node + "/" + one.filter,
+    made("td", one.words, one.to_blame ? "doubt" : "fine"), two(one.weight), two(one.squared)])));
 }
 
 const listed = (names) => names.slice(0, 3).join(", ") + (names.length > 3 ? " and " + (names.length - 3) + " more" : "");

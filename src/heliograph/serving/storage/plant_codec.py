@@ -1,15 +1,254 @@
-"""Serialisation of a plant: bytes that restore the same bits."""
+"""Serialisation of a plant, bytes that restore the same bits, and carrying it over to a network that has changed."""
 
 import json
 import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
+from typing import Any
 
+import jax
 import numpy as np
 from pydantic_core import to_json
 
-from heliograph.live.rows import HeldRow
+from heliograph.live.rows import BEFORE, HeldRow
+from heliograph.live.snapshot import Identity
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
 from heliograph.serving.fleet import Fleet
 from heliograph.serving.plant import Link, Plant
+from heliograph.simulation.network import FUSED
+
+DESCRIPTION = "description"  # key of an identity: its numbers and the layout of its rows, as JSON
+MOST = 64  # numbers of an array that are stored; of a longer one only a hash is
+LISTED = 4  # entries of an array that are named
+SAME = ("precision", "states", "inputs")  # what the rows of a plant mean
+
+
+def description(fleet: Fleet) -> str:
+    """Return the numbers of a network by name, and where the state of each filter stands in a row, as JSON."""
+    network = fleet.network
+    parts: dict[str, PyTree] = {"plant": network.plant}
+    parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
+    parts |= {f"fusion {name!r}": item for name, item in (network.fused | network.meshes).items()}
+    layout = {
+        "nodes": {name: network.nodes[name].received for name in network.names},
+        "given": fleet.lanes.given,
+        "state": fleet.pool.step_rows.state.size,
+        "outputs": fleet.pool.step_rows.outputs.size,
+        "filters": _filter_columns(fleet),
+    }
+    return json.dumps({"values": {name: _values(part) for name, part in parts.items()}, "layout": layout})
+
+
+def _values(part: PyTree) -> dict[str, object]:
+    """Return the numbers of a part by the path of their attributes."""
+    results: dict[str, object] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+        if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
+            array = np.asarray(leaf)
+            results[jax.tree_util.keystr(path)] = array.tolist() if array.size <= MOST else f"{array.size} numbers"
+    return results
+
+
+def _filter_columns(fleet: Fleet) -> dict[str, dict[str, list[Any]]]:
+    """Return the columns of each filter's state by its name: of each leaf its shape, and its columns' begin and end."""
+    network, flat = fleet.network, fleet.pool.step_rows.state
+    numbered = flat.tree(np.arange(float(flat.size)))
+    local, central, *rest = numbered
+    results: dict[str, dict[str, list[Any]]] = {}
+
+    def note(name: str, path: object, columns: np.ndarray) -> None:
+        begin = int(columns.flat[0]) if columns.size else 0
+        results.setdefault(name, {})[jax.tree_util.keystr(path)] = [list(columns.shape), begin, begin + columns.size]  # type: ignore[arg-type]  # a path
+
+    # Filters of nodes stand by kind, (filter x node, ...); central ones by name.
+    for (group, filters), part in zip(network.kinds, local, strict=True):
+        names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
+        for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+            for name, columns in zip(names, np.asarray(leaf), strict=True):
+                note(name, path, np.asarray(columns))
+    for name, part in central.items():
+        for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+            note(f"{FUSED}/{name}", path, np.asarray(leaf))
+    # What centres and neighbours remember goes on only if the nodes are the same.
+    for path, leaf in jax.tree_util.tree_flatten_with_path(rest)[0]:
+        note(f"memory of the fusions of {', '.join(network.names)}", path, np.asarray(leaf))
+    return results
+
+
+class Carrier:
+    """State of one network's stored plants, as that of another network.
+
+    A filter goes on with its state where all parts of this have the shape that they had; others begin with the
+    network's initial law. Rows that may still change are stepped again, with the new numbers.
+
+    Args:
+        fleet: the plants of the network as it is now.
+        mine: its identity.
+        say: called with a line for each change.
+    """
+
+    def __init__(self, fleet: Fleet, mine: Identity, say: Callable[[str], None]):
+        self.fleet, self.mine, self._say = fleet, mine, say
+        self._old: dict[str, Any] = {}
+
+    def begin(self, what: str, other: Identity) -> None:
+        """Report what has changed since the identity `other` of the store `what`.
+
+        Raises:
+            ValueError: other states, inputs or precision, or a store that does not say what it holds.
+        """
+        for name in SAME:
+            if self.mine.get(name) != other.get(name):
+                expected = f"the {name} that are stored, {other.get(name)!r}, to go on with what fits"
+                raise fail(what, expected, repr(self.mine.get(name)))
+        try:
+            self._old = json.loads(other[DESCRIPTION])["layout"]
+            lines = changes(self.mine, other)
+        except (KeyError, ValueError, TypeError):
+            raise fail(what, "a description of the network that it is of", "none") from None
+        new = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
+        lines += [f"{name} begins with the initial law" for name in new if not self._goes_on(name, new)]
+        for line in lines:
+            self._say(f"{what}: {line}")
+
+    def _goes_on(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
+        shapes = [{path: leaf[0] for path, leaf in item.get(name, {}).items()} for item in (self._old["filters"], new)]
+        return shapes[0] == shapes[1]
+
+    def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
+        """Return plants, by name, as this network stores them."""
+        plants = {name: plant_from(name, self._translated(body), self.fleet) for name, body in bodies.items()}
+        # All rows after the base are stepped with what the network is now.
+        for plant in plants.values():
+            plant.dirty = 1 if len(plant.rows.held) > 1 else None
+        self.fleet.step(plants.values())
+        results = {name: plant_bytes(plant, self.fleet) for name, plant in plants.items()}
+        for plant in plants.values():
+            self.fleet.end(plant)
+        return results
+
+    def _translated(self, body: bytes) -> bytes:
+        """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
+        old, pool = self._old, self.fleet.pool
+        names, names_here = list(old["nodes"]), list(self.fleet.network.names)
+        same = [name for name in names if old["nodes"][name] == dict(self._sizes()).get(name)]
+        place = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
+        # Parts of the bytes, as `plant_bytes` writes them.
+        length, count, events, numbers = HEAD.unpack_from(body)
+        head, at = json.loads(body[HEAD.size : HEAD.size + length]), HEAD.size + length
+        whole = np.frombuffer(body, "<i8", 2 * count + 3 * events, at)
+        at += whole.nbytes
+        received = sum(old["nodes"].values())
+        width = old["state"] + old["outputs"] + 2 * old["given"] + received + 2
+        table = np.frombuffer(body, "<f8", count * width, at).reshape(count, width)
+        at += table.nbytes
+        times, values = np.frombuffer(body, "<f8", events, at), np.frombuffer(body, "<f8", numbers, at + 8 * events)
+        # Rows, the base first, in the order of their keys; a row of a node that is gone goes with it.
+        keys = whole[: 2 * count].reshape(count, 2)
+        joint = self.fleet.rows_are_joint
+        rows = [
+            (float(table[i, -1]), int(a) if joint or a == BEFORE else place.get(int(a), BEFORE), int(b), i)
+            for i, (a, b) in enumerate(keys)
+            if i == 0 or joint or int(a) in place
+        ]
+        rows = [rows[0], *sorted(rows[1:])]
+        number = {row[-1]: i for i, row in enumerate(rows)}
+        new = np.stack([self._row(table[row[-1]], place, names) for row in rows])
+        # Events, in the order of their rows.
+        ends = np.cumsum([self._size(names, int(p)) for p in whole[2 * count + 1 :: 3]])
+        parts = np.split(values, ends[:-1]) if events else []
+        triples = whole[2 * count :].reshape(events, 3)
+        stay = [i for i, (row, p, _) in enumerate(triples) if int(p) in place and int(row) in number]
+        events_left = [(number[int(triples[i, 0])], place[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
+        integers = [x for row in rows for x in row[1:3]] + [x for item in events_left for x in item]
+        data = np.concatenate([np.zeros(0), *(parts[i] for i in stay)])
+        head["links"] = {name: link for name, link in head["links"].items() if name in (*same, "inputs")}
+        text = json.dumps(head).encode()
+        assert new.shape[1] == pool.table.shape[1]
+        return b"".join(
+            [
+                HEAD.pack(len(text), len(rows), len(stay), len(data)),
+                text,
+                np.array(integers, dtype="<i8").tobytes(),
+                new.astype("<f8").tobytes(),
+                times[stay].astype("<f8").tobytes(),
+                data.astype("<f8").tobytes(),
+            ]
+        )
+
+    def _sizes(self) -> Iterator[tuple[str, int]]:
+        return ((name, node.received) for name, node in self.fleet.network.nodes.items())
+
+    def _size(self, names: Sequence[str], place: int) -> int:
+        return int(self._old["given"] if place < 0 else self._old["nodes"][names[place]])
+
+    def _row(self, row: np.ndarray, place: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
+        """Return a row of the table with this network's columns."""
+        old, pool, lanes = self._old, self.fleet.pool, self.fleet.lanes
+        given, state = old["given"], old["state"]
+        result = np.zeros(pool.table.shape[1])
+        # The state: of filters that go on their own, of others the start.
+        result[pool.state] = pool.step_rows.start
+        new = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
+        for name in new:
+            if self._goes_on(name, new):
+                for path, (_, begin, end) in new[name].items():
+                    _, first, last = old["filters"][name][path]
+                    result[begin:end] = row[first:last]
+        # Inputs held and step number, then measurements by node, inputs and time.
+        after = state + old["outputs"]
+        result[pool.held], result[pool.at] = row[after : after + given], row[after + given]
+        numbers, received = result[pool.numbers], row[after + given + 1 :]
+        numbers[:] = np.nan
+        numbers[lanes.received :] = received[len(received) - given - 1 :]
+        starts = np.cumsum([0, *old["nodes"].values()])
+        here = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
+        for i, j in place.items():
+            if i >= 0:
+                numbers[here[j] : here[j + 1]] = received[starts[i] : starts[i + 1]]
+        return result
+
+
+def changes(mine: Identity, other: Identity) -> list[str]:
+    """List what has changed from the identity `other` to `mine`: options and versions, nodes and filters, numbers."""
+    lines = [
+        f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
+        for name in {**mine, **other}
+        if mine.get(name) != other.get(name)
+        and not name.startswith("numbers of ")
+        and name not in (DESCRIPTION, "what is computed", "layout of the store")
+    ]
+    # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program.
+    here, there = (json.loads(item[DESCRIPTION])["values"] for item in (mine, other))
+    for part in here:
+        if part in there:
+            lines += [
+                f"{part}{path}: {line}"
+                for path in {**there[part], **here[part]}
+                for line in _changed(there[part].get(path), here[part].get(path))
+            ]
+            if not lines and mine.get(f"numbers of {part}") != other.get(f"numbers of {part}"):
+                lines.append(f"{part}: numbers of a long array")
+    if not lines and mine.get("what is computed") != other.get("what is computed"):
+        lines.append("functions of the network")
+    return lines
+
+
+def _changed(before: object, after: object) -> list[str]:
+    """Describe the change of a number or an array, entry by entry where the shape is the same."""
+    if before == after:
+        return []
+    try:
+        a, b = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
+    except (TypeError, ValueError):
+        return [f"{before} -> {after}"]
+    if a.shape != b.shape or before is None or after is None:
+        return [f"{before} -> {after}"]
+    places = [tuple(map(int, place)) for place in np.argwhere(a != b)]
+    lines = [f"{list(place) if a.size > 1 else ''} {a[place]:.6g} -> {b[place]:.6g}".strip() for place in places]
+    return lines[:LISTED] + ([f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else [])
+
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
 

@@ -25,11 +25,11 @@ from sqlalchemy import (
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
-from heliograph.live.identity import Identity, check_same, versions
+from heliograph.live.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
-from heliograph.serving.storage.carrying import DESCRIPTION, Carrier
 from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.plant_codec import DESCRIPTION, Carrier
 from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
 
 LAYOUT = "3"  # of these tables; those of layout 1 had no checksums, of 2 no description of the network

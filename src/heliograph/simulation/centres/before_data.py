@@ -7,14 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.filters.linear.plan import Plan
+from heliograph.fusion.cross_covariance import Factors, initial_factors, joint_of, weighted_sources
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import factored_weights, matrix_weights
-from heliograph.numerics.check import array, check_horizon, fail, instance
+from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, plan
@@ -52,7 +54,7 @@ class CrossCovariances:
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Cov(e_i, e_j) of all pairs."""
-        return _joint(self.shared, self.local)
+        return np.asarray(joint_of(self.shared, self.local))
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -67,8 +69,8 @@ class CrossCovariances:
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
         weights = _weights(self.shared, self.local)
-        shared, local = _weighted(weights, self.shared, self.local)
-        return weights, shared @ shared.T + local
+        shared, local = weighted_sources(weights, self.shared, self.local)
+        return weights, np.asarray(shared @ shared.T + local)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Moments at relays that forward the matrix-weighted estimate of their nodes, as the nodes of the next level.
@@ -94,7 +96,7 @@ class CrossCovariances:
         for names in relays.values():
             mine = [place[name] for name in names]
             shared, local = self.shared[mine], self.local[mine]
-            parts.append(_weighted(_weights(shared, local), shared, local))
+            parts.append(weighted_sources(_weights(shared, local), shared, local))
         shared, local = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
         return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, local)
@@ -104,22 +106,7 @@ def _weights(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "n node
     scale = np.sqrt(np.einsum("iaa->ia", local) + np.einsum("ias,ias->ia", shared, shared))
     scale = np.where(scale > 0, scale, 1.0)
     least = np.linalg.eigvalsh(local / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(factored_weights(shared, local) if least > REGULAR else matrix_weights(_joint(shared, local)))
-
-
-def _weighted(
-    weights: np.ndarray, shared: np.ndarray, local: np.ndarray
-) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
-    """Sources of a weighted sum of the errors, and the covariance of its independent part."""
-    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, local, weights)
-
-
-def _joint(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "node n node n"]:
-    count, n, _ = shared.shape
-    flat, items = shared.reshape(count * n, -1), np.arange(count)
-    result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
-    result[items, :, items, :] += local
-    return result
+    return np.asarray(factored_weights(shared, local) if least > REGULAR else matrix_weights(joint_of(shared, local)))
 
 
 def cross_covariances(
@@ -174,7 +161,7 @@ def fused_covariances(
 def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Plan the filters for the inputs."""
     network.check_horizon(check_horizon(horizon))
-    u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(network.inputs)))
+    u = inputs_of(network, inputs, horizon)
     filters = AllFilters(network)
     if not filters.centres:
         raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
@@ -187,19 +174,15 @@ def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple
 def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     (centre,) = filters.informed
 
-    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
-        (separate, factors), (k, u_k) = carry, row
-        local = centre.gathered(filters.matrices(centre, separate, u_k, k))
-        spread = factors.state @ factors.state.T
-        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
-        return (filters.followed(separate, u_k, k), advance_factors(factors, step, motion, noise, k)), None
-
     separate, _, _, known, _ = filters.init()
     nodes, n = known[0].errors.bias.shape
     items = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
     start = separate, initial_factors(known[0].errors, items * len(u))
-    result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
-    return result
+
+    def matrices(local: PyTree, u_k: jax.Array, k: jax.Array) -> Plan:
+        return centre.gathered(filters.matrices(centre, local, u_k, k))
+
+    return centre.factors(start, matrices, filters.followed, u)
 
 
 @quickly_compiled

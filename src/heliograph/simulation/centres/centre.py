@@ -1,7 +1,7 @@
 """Fusion centre that knows the network: it propagates the joint moments of the local errors, before any data."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,13 +11,15 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.linear.plan import Plan, is_linear_filter, linear_step
+from heliograph.filters.linear.plan import Linearised, Plan, is_linear_filter, linear_step
 from heliograph.fusion.cross_covariance import (
     Errors,
     ErrorStep,
+    Factors,
     Motion,
     Observation,
     advance,
+    advance_factors,
     error_step,
     initial_errors,
     moved_state,
@@ -71,28 +73,26 @@ def _linear_observation(
     return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
-class AbstractObservation(Module):
-    """Measurement model of all nodes, in the nodes' order, padded with zero rows to the longest measurement."""
+class Apart(Module):
+    """Measurement models of nodes that share nothing, by groups; `order` brings them into the order of the nodes.
 
-    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
-        """Moments of the measurements at step k, for a plant with these moments."""
-        raise NotImplementedError
+    `counts` of the groups' nodes are needed where a group measures nothing, None among the groups.
+    """
 
-
-class Apart(AbstractObservation):
-    """Nodes that share nothing, by groups; `order` brings them into the order of the nodes."""
-
-    groups: tuple[ObservationModel, ...]
+    groups: tuple[ObservationModel | None, ...]
     order: np.ndarray
     size: int = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """Moments of the measurements, group after group."""
-        parts = [item.observe(mean, covariance, k, self.size) for item in self.groups]
+        m, n = self.size, len(mean)
+        parts = [Observation(*(jnp.zeros((self.counts[i], *s)) for s in ((m, n), (m,), (m, m)))) if item is None
+                 else item.observe(mean, covariance, k, m) for i, item in enumerate(self.groups)]  # fmt: skip
         return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
-class Together(AbstractObservation):
+class Together(Module):
     """Common sensor and channel, of whose outputs each node receives some `rows`; -1 stands for none."""
 
     sensor: AnySensor
@@ -122,7 +122,7 @@ class Centre(Module):
     """
 
     plant: AnyPlant
-    observation_model: AbstractObservation
+    observation_model: Apart | Together
     rules: dict[str, AbstractInformedFusion]
     order: np.ndarray
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -151,21 +151,29 @@ class Centre(Module):
         observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
         return motion, error_step(local, motion, observation), observation.noise
 
+    def factors(
+        self, start: tuple[PyTree, Factors], matrices: Callable[..., Plan], follow: Callable[..., PyTree], u: Array
+    ) -> Factors:
+        """Propagate the errors by their sources over all steps, from the filters' states and the factors before them.
+
+        `matrices(states, u, k)` and `follow(states, u, k)` are those of the filters' step k, and their next states.
+        """
+
+        def body(
+            carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[PyTree, Factors], None]:
+            (local, factors), (k, u_k) = carry, row
+            spread = factors.state @ factors.state.T
+            motion, step, noise = self.moves(factors.mean, spread, matrices(local, u_k, k), u_k, k)
+            return (follow(local, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+
+        result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+        return result
+
     def gathered(self, parts: Sequence[Plan]) -> Plan:
         """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
 
-        def padded(plan: Plan) -> Plan:
-            more = (0, self.size - plan.offset.shape[-1])
-            return Plan(
-                plan.transition,
-                plan.drift,
-                jnp.pad(plan.gain, ((0, 0), (0, 0), more)),
-                jnp.pad(plan.output, ((0, 0), more, (0, 0))),
-                jnp.pad(plan.offset, ((0, 0), more)),
-                jnp.pad(plan.innovation, ((0, 0), more, more)),
-            )
-
-        return Plan(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
+        return gathered(parts, self.order, self.size)
 
     def step(
         self, state: CentreState, parts: Sequence[Plan], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
@@ -178,6 +186,22 @@ class Centre(Module):
             after[name], (mean, covariance) = rule.use(state.rules[name], happened, reports)
             results[name] = Estimate(mean, covariance, self.claim)
         return CentreState(happened.errors, after), results
+
+
+MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, -1), "noise": (-2, -1)}
+Matrices = TypeVar("Matrices", Plan, Linearised)
+
+
+def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
+    """Matrices of several groups of filters in this order, with zeros up to a measurement of `size` components."""
+
+    def padded(name: str, leaf: jax.Array) -> jax.Array:
+        more = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
+                for axis, length in enumerate(leaf.shape)]  # fmt: skip
+        return jnp.pad(leaf, more)
+
+    kind = type(parts[0])
+    return kind(*(jnp.concatenate([padded(f, getattr(p, f)) for p in parts])[order] for f in kind._fields))
 
 
 def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:

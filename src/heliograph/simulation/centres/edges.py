@@ -10,45 +10,35 @@ import numpy as np
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, at, first, stack, structure, unstack
+from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import Erasure, arrived
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.draws import checksum
-from heliograph.simulation.shared_fading import deliver, memory_places, start
+from heliograph.simulation.shared_fading import ChannelGroup, channel_groups, deliver, start
 
 Recorded = Mapping[str, SentReports | ArrayLike]
 
 
-class EdgeGroup(Module):
-    """Channels of one structure, stacked; checksums of the edges' names, of their memories, and their places.
+class Edges(Module):
+    """All edges of a fusion between neighbours; none of them loses anything where there are no groups.
 
-    Shapes: checksums (edge,), memories (edge, memories of a channel), rows and columns (edge,) among the graph's.
+    `slots` (edge,) are the places of their flags among those of all (node, degree).
     """
 
-    channel: Channel
-    checksums: np.ndarray
-    memories: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
-
-
-class Edges(Module):
-    """All edges of a fusion between neighbours; none of them loses anything where there are no groups."""
-
-    groups: tuple[EdgeGroup, ...]
+    groups: tuple[ChannelGroup, ...]
+    slots: np.ndarray
     present: np.ndarray
     rounds: int = eqx.field(static=True)
 
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
         """Return the states of the channels before the first step."""
 
-        def single(group: EdgeGroup) -> PyTree:
+        def single(group: ChannelGroup) -> PyTree:
             return start(group.channel, key, group.checksums, group.memories)
 
         return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
@@ -61,7 +51,7 @@ class Edges(Module):
             flags, following = jnp.asarray(self.present), []
             for group, state in zip(self.groups, states, strict=True):
 
-                def single(item: EdgeGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+                def single(item: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
                     channel = at(item.channel, k)
                     sent = jnp.zeros(channel.inputs)
                     state, z = deliver(channel, state, sent, key, count, item.checksums, item.memories)
@@ -70,7 +60,7 @@ class Edges(Module):
                 both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
                 state, arrives = both(group, state, k * self.rounds + number)
                 following.append(state)
-                flags = flags.at[group.rows, group.columns].set(arrives)
+                flags = flags.ravel().at[self.slots[group.places]].set(arrives).reshape(flags.shape)
             states = tuple(following)
             rounds.append(flags)
         return states, jnp.stack(rounds, axis=1)
@@ -113,37 +103,17 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
         ValueError: links of other edges, links that do more to a message than lose it, or of which nobody knows.
     """
     if fusion.link is None:
-        return Edges((), graph.present, fusion.rounds)
+        return Edges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
     sender_receiver = graph.edges
     names = [f"{graph.nodes[j]} to {graph.nodes[i]}" for j, i in sender_receiver]
     if isinstance(fusion.link, Mapping) and set(fusion.link) != set(names):
         wrong = sorted(set(fusion.link) ^ set(names))[:3]
         raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
     channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
-    for item in {id(channel): channel for channel in channels}.values():
-        check_edge(item)
-    # Edges with channels of one structure, by place in the graph's rows.
-    memories = memory_places(dict(zip(names, channels, strict=True)))
-    receivers, columns = np.nonzero(graph.present[:, 1:])
-    alike: dict[object, list[int]] = {}
-    for e, channel in enumerate(channels):
-        alike.setdefault(structure(anonymous(channel)), []).append(e)
-    groups = [_group(names, channels, memories, receivers, columns + 1, which) for which in alike.values()]
-    return Edges(tuple(groups), graph.present, fusion.rounds)
-
-
-def _group(
-    names: Sequence[str],
-    channels: Sequence[Channel],
-    memories: Mapping[str, np.ndarray],
-    rows: np.ndarray,
-    columns: np.ndarray,
-    which: Sequence[int],
-) -> EdgeGroup:
-    held = np.stack([memories[names[e]] for e in which])
-    channel = stack([anonymous(channels[e]) if held.shape[1] else channels[e] for e in which])
-    checksums = np.array([checksum(names[e]) for e in which], dtype=np.uint32)
-    return EdgeGroup(channel, checksums, held, rows[list(which)], columns[list(which)])
+    for channel in {id(c): c for c in channels}.values():
+        check_edge(channel)
+    slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
+    return Edges(channel_groups(dict(zip(names, channels, strict=True))), slots, graph.present, fusion.rounds)
 
 
 def check_edge(link: Channel) -> None:

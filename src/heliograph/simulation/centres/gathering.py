@@ -16,7 +16,6 @@ from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.centre import (
-    AbstractObservation,
     Apart,
     Centre,
     Together,
@@ -133,12 +132,9 @@ def _fused(
     sources, order = [], []
     # Kinds and filters of the sources, and the order of the nodes in them.
     for item, mine in zip(items, nodes, strict=True):
-        source = tuple({places[node, item.filter][:2]: None for node in mine})
-        results = {
-            node: i for i, node in enumerate(n for k, _ in source for n in network.groups[network.kinds[k].group])
-        }
+        source, which = gathering(network, places, mine, item.filter)
         sources.append(source)
-        order.append([results[node] for node in mine])
+        order.append(which)
     # Numbers of all fusions along a leading axis.
     quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
     rules = stack([item.rule for item in items])
@@ -190,7 +186,7 @@ def gathering(
 
 def _observe(
     network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
-) -> AbstractObservation:
+) -> Apart | Together:
     """Measurement model of these nodes for a centre."""
     if network.common is not None:
         rows = network.rows()

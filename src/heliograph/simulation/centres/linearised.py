@@ -17,6 +17,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
+from heliograph.simulation.centres.centre import gathered
 
 
 class Followed(NamedTuple):
@@ -61,7 +62,7 @@ class LinearisedCentre(Module):
         k: jax.Array,
     ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
         """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
-        local, reports = self._gathered(parts), jnp.concatenate(means)[self.order]
+        local, reports = gathered(parts, self.order, self.size), jnp.concatenate(means)[self.order]
         # I - K_i C_i of all nodes.
         plant = at(self.plant, k)
         keep = jnp.eye(reports.shape[-1]) - local.gain @ local.output
@@ -80,20 +81,6 @@ class LinearisedCentre(Module):
             after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, local.noise, errors), reports)
             following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
         return following, results
-
-    def _gathered(self, parts: Sequence[Linearised]) -> Linearised:
-        """Gather the matrices in the order of the nodes, padded with zeros to the longest measurement."""
-
-        def padded(item: Linearised) -> Linearised:
-            more = (0, self.size - item.gain.shape[-1])
-            return Linearised(
-                item.predicted,
-                jnp.pad(item.gain, ((0, 0), (0, 0), more)),
-                jnp.pad(item.output, ((0, 0), more, (0, 0))),
-                jnp.pad(item.noise, ((0, 0), more, more)),
-            )
-
-        return Linearised(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
 
 
 def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:

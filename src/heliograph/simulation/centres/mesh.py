@@ -10,8 +10,9 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
 from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
@@ -21,28 +22,29 @@ from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, trans
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.centre import ObservationModel, observation_model
+from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
 from heliograph.simulation.centres.edges import Edges, edges_of
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 DENSE = 200  # nodes whose joint covariance is propagated at every step
 Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
+Ahead = Sequence[Sequence[Array]]  # parts and covariance of weights, by part of the nodes; none where there are none
 
 
 class MeshState(NamedTuple):
     """Estimates of all nodes, the covariances by which they weigh, and what is known before any data.
 
     Shapes: mean (node, n), covariance (node, n, n); joint (node, n, node, n) covariance of all errors, None where the
-    rule does without; plant: mean (n,) and covariance (n, n) of the state; sent (node, n): estimates that were sent
-    last, predicted.
+    rule does without; plant: mean (n,) and covariance (n, n) of the state; sent (node, degree, n): estimates of its
+    neighbours that each node received last, predicted, where not all are sent.
     """
 
     mean: Float[jax.Array, "node n"]
     covariance: Float[jax.Array, "node n n"]
     joint: Float[jax.Array, "node n node n"] | None
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
-    sent: Float[jax.Array, "node n"]
+    sent: Float[jax.Array, "node degree n"] | None
 
 
 class Data(NamedTuple):
@@ -83,22 +85,17 @@ class Rows(Module):
 class Mesh(Module):
     """A fusion between neighbours: the graph, its edges, the rule on parts of its nodes, models of the measurements.
 
-    `groups`: models of the measurements of the network's groups of nodes, None for nodes without a sensor; `order`
-    brings the nodes of all groups into the order of the mesh, `places` the mesh into that of the groups again,
-    `ranks` the nodes of all buckets.
+    `places` bring the nodes into the order of the network's groups again, `ranks` the nodes of all buckets.
     """
 
     plant: AnyPlant
     buckets: tuple[Rows, ...]
     ranks: np.ndarray
     edges: Edges
-    groups: tuple[ObservationModel | None, ...]
+    observation_model: Apart
     senders: np.ndarray
-    order: np.ndarray
-    counts: tuple[int, ...] = eqx.field(static=True)
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
-    size: int = eqx.field(static=True)
     alpha: float | None = eqx.field(static=True)
     needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -109,53 +106,58 @@ class Mesh(Module):
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
         joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
-        means = jnp.tile(mean, (nodes, 1))
-        return MeshState(means, jnp.tile(covariance, (nodes, 1, 1)), joint, (mean, covariance), means)
+        sent = None if self.alpha is None else jnp.tile(mean, (*self.senders.shape, 1))
+        both = jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1))
+        return MeshState(*both, joint, (mean, covariance), sent)
 
     def step(
         self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
-        u: jax.Array, k: jax.Array,
+        u: jax.Array, k: jax.Array, ahead: Ahead = (),
     ) -> tuple[MeshState, tuple[Estimate, ...]]:  # fmt: skip
-        """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes."""
-        blocks = self.blocks(state.joint)
-        there = jnp.concatenate([self._rows(part) for part in z])[self.order]
-        parts = self.parts(state.covariance, blocks, state.plant, ~jnp.isnan(there), arrived, u, k)
+        """Exchange, fuse, predict and correct at step k: next state, and estimates (1, node, ...) by group of nodes.
+
+        `ahead` has weights that were computed before.
+        """
+        there = jnp.concatenate([self._rows(part) for part in z])[self.observation_model.order]
+        blocks, present = self.blocks(state.joint), ~jnp.isnan(there)
+        parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead)
         gains, motion = parts.gains, parts.motion
         # All rounds but the last only intersect.
         mean = state.mean
         for weights in parts.exchanges:
-            mean = mean + self._pulled(weights.front, weights.parts, mean, mean)
-        sent = self._sent(mean, state)
+            mean = mean + self._pulled(weights.front, weights.parts, mean, mean[self.senders])
+        sent = self._sent(mean, state, jnp.asarray(arrived[:, -1]))
         # Innovations about one common prediction, so that no digits of the means themselves are lost.
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)
         observation = parts.data.observation
-        off = jnp.where(jnp.isnan(there), 0.0, there - observation.offset - observation.gain @ common)
+        off = jnp.where(present, there - observation.offset - observation.gain @ common, 0.0)
         sums = self._collected(jnp.einsum("inm,im->in", parts.data.weighted, off), arrived)
         # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
         innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
-        mean = (
-            predicted
-            + self._pulled(gains.front, gains.parts, mean, sent)
-            + jnp.einsum("iab,ib->ia", gains.gain, innovation)
-        )
+        pulled = self._pulled(gains.front, gains.parts, mean, sent)
+        mean = predicted + pulled + jnp.einsum("iab,ib->ia", gains.gain, innovation)
         # Covariance of all errors where the rule needs it; it is then what is claimed.
         joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
-        after = MeshState(mean, gains.covariance, joint, parts.plant, sent @ motion.matrix.T + motion.shift)
-        return after, self._by_group(mean, claimed)
+        held = None if state.sent is None else sent @ motion.matrix.T + motion.shift
+        return MeshState(mean, gains.covariance, joint, parts.plant, held), self._by_group(mean, claimed)
 
-    def _sent(self, mean: jax.Array, state: MeshState) -> Float[jax.Array, "node n"]:
-        """Estimates that the neighbours have: those of now, or with events those that were sent last, predicted.
+    def _sent(self, mean: jax.Array, state: MeshState, arrives: jax.Array) -> Float[jax.Array, "node degree n"]:
+        """Estimates that the nodes have of their neighbours: those of now, or with events what they received last.
 
-        A node sends where (xhat - xs)' P^-1 (xhat - xs) > alpha n; the error of xs is then at most
-        (1 + sqrt(alpha n))^2 P: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
+        A node sends where (xhat - xs)' P^-1 (xhat - xs) > alpha n for the xs of anybody who may receive it; where its
+        message arrives, the error of xs is then at most (1 + sqrt(alpha n))^2 P, whatever got lost before:
+        E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
         """
-        if self.alpha is None:
-            return mean
-        off = mean - state.sent
-        far = jnp.einsum("ia,iab,ib->i", off, jax.vmap(inverse)(state.covariance), off)
-        return jnp.where(far[:, None] > self.alpha * off.shape[1], mean, state.sent)
+        now = mean[self.senders]
+        if state.sent is None or self.alpha is None:
+            return now
+        off, information = now - state.sent, jax.vmap(inverse)(state.covariance)
+        far = jnp.einsum("ida,idab,idb->id", off, information[self.senders], off) > self.alpha * off.shape[-1]
+        moving = (far & self.edges.present).astype(int)[:, 1:]  # for others
+        moved = jnp.zeros(len(mean), dtype=int).at[self.senders[:, 1:]].max(moving)
+        return jnp.where((arrives & (moved[self.senders] > 0))[..., None], now, state.sent)
 
     def parts(
         self,
@@ -166,6 +168,7 @@ class Mesh(Module):
         arrived: Arrived,
         u: Array,
         k: Array,
+        ahead: Ahead = (),
     ) -> Parts:
         """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
         covariance, there, arrived, u = (jnp.asarray(part) for part in (covariance, there, arrived, u))
@@ -176,26 +179,26 @@ class Mesh(Module):
         after = moved_state(jnp.asarray(moments[0]), jnp.asarray(moments[1]), motion)
         exchanges = []
         for number in range(self.edges.rounds - 1):
-            exchanges.append(self._exchange(covariance, arrived[:, number]))
-            covariance = exchanges[-1].covariance
+            exchanges.append(self._over_nodes(_weights, covariance, None, arrived[:, number]))
+            covariance = jnp.asarray(exchanges[-1].covariance)
         # What each node learns of the measurements, and its gains.
-        data = self._data(self.observe(after, jnp.asarray(k)), there)
+        data = self._data(self.observation_model.observe(*after, jnp.asarray(k)), there)
         information = self._collected(data.information, arrived)
         complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
-        gains = self.gains(covariance, held, arrived[:, -1], motion, information, complete)
+        gains = self.gains(covariance, held, arrived[:, -1], motion, information, complete, ahead)
         return Parts(motion, after, tuple(exchanges), data, information, gains)
 
     def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
         """Measurements of a group, filled with NaN up to the longest."""
-        return jnp.pad(z, ((0, 0), (0, self.size - z.shape[1])), constant_values=jnp.nan)
+        return jnp.pad(z, ((0, 0), (0, self.observation_model.size - z.shape[1])), constant_values=jnp.nan)
 
     def _pulled(
-        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n n"],
-        mean: jax.Array, sent: jax.Array,
+        self, front: Float[jax.Array, "node n n"], parts: Float[jax.Array, "node degree n *n"],
+        mean: jax.Array, sent: Float[jax.Array, "node degree n"],
     ) -> Float[jax.Array, "node n"]:  # fmt: skip
-        """front_i sum_j parts_ij (xs_j - xhat_i) over the neighbours j of i and what they sent."""
-        away = (sent[self.senders] - mean[:, None]).at[:, 0].set(0.0)
-        off = jnp.einsum("idab,idb->ia", parts, away)
+        """front_i sum_j parts_ij (xs_ij - xhat_i) over the neighbours j of i and what it has of them."""
+        away = (sent - mean[:, None]).at[:, 0].set(0.0)
+        off = jnp.einsum("idab,idb->ia", parts, away) if parts.ndim == 4 else jnp.sum(parts * away, axis=1)
         return jnp.einsum("iab,ib->ia", front, off)
 
     def _data(self, observation: Observation, there: Bool[jax.Array, "node m"]) -> Data:
@@ -205,21 +208,6 @@ class Mesh(Module):
         weighted, information = jax.vmap(_message)(gain, noise, real & there)
         complete = jax.vmap(_message)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
-
-    def observe(self, moments: tuple[jax.Array, jax.Array], k: jax.Array) -> Observation:
-        """Measurement models of all nodes at step k, rows of zeros where a node has none."""
-        n = len(moments[0])
-        parts = []
-        for group, count in zip(self.groups, self.counts, strict=True):
-            shapes = (count, self.size, n), (count, self.size), (count, self.size, self.size)
-            none = Observation(*(jnp.zeros(shape) for shape in shapes))
-            parts.append(none if group is None else group.observe(*moments, k, self.size))
-        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
-
-    def _exchange(self, covariance: jax.Array, present: jax.Array) -> Weights:
-        """Weights of an exchange that only intersects, with the covariances after it."""
-        result: Weights = self._over_nodes(lambda rule, item: rule.neighbour_weights(item), covariance, None, present)
-        return result
 
     def blocks(self, joint: jax.Array | None) -> jax.Array | None:
         """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
@@ -235,12 +223,13 @@ class Mesh(Module):
         blocks: jax.Array | None,
         present: jax.Array,
         *rest: jax.Array,
+        ahead: Ahead = (),
     ) -> PyTree:
         """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
         information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
-        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (1 + len(rest))))
+        both = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         results = []
-        for part in self.buckets:
+        for part, known in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = part.rows, part.width
             theirs = self.senders[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
@@ -248,7 +237,7 @@ class Mesh(Module):
             if self.alpha is not None:  # what was sent last errs by more than the estimate
                 wider = np.where(np.arange(width) > 0, (1 + np.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
                 item = item._replace(traces=item.traces * wider, information=item.information / wider[:, None, None])
-            results.append(both(part.rule, item, *(leaf[rows] for leaf in rest)))
+            results.append(both(part.rule, item, *(leaf[rows] for leaf in rest), known))
         if len(results) == 1:
             return results[0]
         # Rows of one length again, in the order of the nodes.
@@ -281,14 +270,26 @@ class Mesh(Module):
         motion: Motion,
         information: jax.Array,
         complete: jax.Array,
+        ahead: Ahead = (),
     ) -> Gains:
         """Gains of all nodes."""
 
-        def single(rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array) -> Gains:
-            return rule.neighbour_gains(item, Step(motion.matrix, motion.noise, arrived, every))
+        def single(
+            rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array, known: Sequence[jax.Array]
+        ) -> Gains:
+            step = Step(motion.matrix, motion.noise, arrived, every)
+            if known:
+                return gains_of(Weights(jnp.eye(len(motion.shift)), *known), step)
+            return rule.neighbour_gains(item, step)
 
-        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete)
+        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete, ahead=ahead)
         return result
+
+    def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
+        """Weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
+        weights = [part.rule.weights_ahead(arrived[:, part.rows, -1, : part.width])
+                 for part in self.buckets if isinstance(part.rule, FrozenWeights)]  # fmt: skip
+        return () if None in weights else tuple(filter(None, weights))
 
     def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
         """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
@@ -316,14 +317,20 @@ class Mesh(Module):
         )
 
 
-def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n n"]:
+def _weights(rule: AbstractFusion, item: Believed, *_: PyTree) -> Weights:
+    """Weights of an exchange that only intersects, with the covariance after it."""
+    return rule.neighbour_weights(item)
+
+
+def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
     """Fill rows with zeros up to the longest."""
-    return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), (0, 0), (0, 0)))
+    return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
 
 
 def transitions(gains: Gains, motion: Motion) -> Float[jax.Array, "node degree n n"]:
     """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
-    others = (gains.front[:, None] @ gains.parts).at[:, 0].set(0.0)
+    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * jnp.eye(len(motion.shift))
+    others = (gains.front[:, None] @ parts).at[:, 0].set(0.0)
     return others.at[:, 0].set(gains.innovation @ motion.matrix - others.sum(axis=1))
 
 
@@ -362,14 +369,16 @@ def mesh_of(network: Network, name: str) -> Mesh:
         ),
         ranks=np.argsort(np.concatenate([part.senders[:, 0] for part in graph.buckets()])),
         edges=edges_of(fusion, graph),
-        groups=tuple(groups),
+        observation_model=Apart(
+            tuple(groups),
+            np.array([order[node] for node in nodes]),
+            max(1, *(node.received for node in network.nodes.values())),
+            tuple(map(len, network.groups)),
+        ),
         senders=graph.senders,
-        order=np.array([order[node] for node in nodes]),
-        counts=tuple(len(names) for names in network.groups),
         places=tuple(mine),
         nodes=graph.nodes,
         alpha=fusion.alpha,
-        size=max(1, *(node.received for node in network.nodes.values())),
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],
     )

@@ -10,7 +10,6 @@ from scipy.sparse.csgraph import maximum_flow
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
-from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
@@ -19,7 +18,7 @@ from heliograph.numerics.check import fail
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import arrival_chance, check_edge, edges_of
+from heliograph.simulation.centres.edges import arrival_chance, edges_of
 from heliograph.simulation.node import Node
 
 if TYPE_CHECKING:
@@ -54,8 +53,6 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
         if name in item.filters:
             raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
     _check_rule(what, fusion, network)
-    for link in {id(item): item for item in _links(fusion)}.values():
-        check_edge(link)
     graph = graph_of(neighbours, network.mesh_nodes(name))
     edges_of(fusion, graph)
     fusion.rule.placed(graph)
@@ -80,13 +77,6 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
-def _links(fusion: Fusion) -> list[Channel]:
-    """Channels of the edges as they were given."""
-    if fusion.link is None:
-        return []
-    return list(fusion.link.values()) if isinstance(fusion.link, dict) else [fusion.link]
-
-
 def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
     """Refuse a rule without weights for neighbours, more than it can do, and a start that has no inverse."""
     rule, kind = fusion.rule, type(fusion.rule)
@@ -96,12 +86,11 @@ def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
         raise fail(f"{what} by {kind.__name__}", "with_mean=False", True)
     if fusion.rounds > 1 and (rule.needs_joint or isinstance(rule, FrozenWeights)):
         raise fail(f"{what} by {kind.__name__}", "one round (more need a rule that intersects)", fusion.rounds)
-    # With events no matrix may depend on what is sent, and nothing may get lost.
+    # With events no matrix may depend on what is sent.
     if fusion.alpha is not None and (rule.needs_joint or isinstance(rule, FrozenWeights)):
         raise fail(f"{what} by {kind.__name__}", "a rule that intersects, where there are events", fusion.alpha)
-    if fusion.alpha is not None and (fusion.rounds > 1 or fusion.link is not None):
-        expected = "one round without losses, where there are events (a lost message looks like one that was not sent)"
-        raise fail(what, expected, f"{fusion.rounds} rounds" if fusion.link is None else "a link")
+    if fusion.alpha is not None and fusion.rounds > 1:
+        raise fail(what, "one round, where there are events", f"{fusion.rounds} rounds")
     # Information of a singular start has no number.
     start = np.asarray(first(network.plant).initial_covariance)
     scale = np.sqrt(np.diagonal(start))

@@ -141,7 +141,7 @@ def _parts(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> Parts:  # fmt: skip
-    there = np.ones((len(mesh.senders), mesh.size), dtype=bool)
+    there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     return mesh.parts(covariance, blocks, moments, there, arrived, u, k)
 
 
@@ -255,7 +255,7 @@ def best_possible(
 def models(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np.ndarray, k: np.ndarray) -> Parts:
     """Parts of a step at which everything arrives, for the models of plant and measurements in it."""
     lossless = mesh.edges.lossless()
-    there = np.ones((len(mesh.senders), mesh.size), dtype=bool)
+    there = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
     if mesh.needs_joint:
         degree, n = mesh.senders.shape[1], covariance.shape[-1]

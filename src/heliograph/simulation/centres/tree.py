@@ -9,17 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.fusion.cross_covariance import initial_factors, joint_of, weighted_sources
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import matrix_weights
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.numerics.check import array, check_count, fail, function, instance
+from heliograph.numerics.check import check_count, fail, function, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.centre import Apart, Centre, ObservationModel, described
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
@@ -109,7 +110,7 @@ def relay_tree(
         (name,) = leaf.filters
         alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
         alone.check_horizon(steps)
-        u = array("inputs", np.zeros((steps, 0)) if inputs is None else inputs, (steps, len(alone.inputs)))
+        u = inputs_of(alone, inputs, steps)
         # Leaves in blocks, whole relays each: covariances, weights, and the relays as nodes.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
@@ -150,18 +151,16 @@ def _followed(
     centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")
     quiet = jnp.zeros((count, size))
 
-    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[tuple[PyTree, Factors], None]:
-        (separate, factors), (k, u_k) = carry, row
-        local = alike.matrices(centre.read, separate, 0, quiet, u_k, k)
-        spread = factors.state @ factors.state.T
-        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
-        return (alike.step(separate, quiet, u_k, k)[0], advance_factors(factors, step, motion, noise, k)), None
-
     # Errors by their sources, over the horizon.
     state = alike.init()
     n = len(first(plant).states)
     begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
-    result: Factors = jax.lax.scan(body, (state, begin), (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    result = centre.factors(
+        (state, begin),
+        lambda local, u_k, k: alike.matrices(centre.read, local, 0, quiet, u_k, k),
+        lambda local, u_k, k: alike.step(local, quiet, u_k, k)[0],
+        u,
+    )
     level = Level(result.shared, result.local)
     # Full relays at once, then the last one.
     full = count - count % degree
@@ -183,16 +182,7 @@ def _relay(children: Level) -> tuple[jax.Array, Level]:
 def _fuse(children: Level) -> tuple[jax.Array, Level]:
     shared, local = jnp.asarray(children.shared), jnp.asarray(children.local)
     weights = matrix_weights(joint_of(shared, local))
-    return weights, Level(
-        jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, local, weights)
-    )
-
-
-def joint_of(shared: Array, local: Array) -> Float[jax.Array, "node n node n"]:
-    """Cov(e_i, e_j) of all pairs."""
-    count, n, _ = shared.shape
-    flat, items = jnp.asarray(shared).reshape(count * n, -1), np.arange(count)
-    return (flat @ flat.T).reshape(count, n, count, n).at[items, :, items, :].add(local)
+    return weights, Level(*weighted_sources(weights, shared, local))
 
 
 def _spread(level: Level) -> Array:

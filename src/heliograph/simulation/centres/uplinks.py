@@ -13,13 +13,14 @@ from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
-from heliograph.model.over_time import OverTime, at, over_time, stack, structure
+from heliograph.model.over_time import OverTime, at, over_time, stack
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.simulation.centres.centre import described
-from heliograph.simulation.draws import CHANNEL, checksum, draw_key
+from heliograph.simulation.draws import CHANNEL, draw_key
+from heliograph.simulation.shared_fading import ChannelGroup, channel_groups
 
 
 class Drawn(NamedTuple):
@@ -54,21 +55,13 @@ class InFlight(NamedTuple):
     quantizers: PyTree
 
 
-class Group(Module):
-    """Nodes with channels of one structure: the channels stacked, the nodes' checksums and places."""
-
-    channel: Channel
-    checksums: np.ndarray
-    places: np.ndarray
-
-
 class Uplinks(Module):
     """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
 
     Shapes: delay (node, ages), every (node,). `links`: the centre's model of them.
     """
 
-    groups: tuple[Group, ...]
+    groups: tuple[ChannelGroup, ...]
     quantizers: AbstractQuantizer | None
     links: Links | OverTime
     delay: np.ndarray
@@ -190,18 +183,14 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     mine, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
     ages = max(len(link.delay) for link in mine)
     channels = [perfect(n) if link.channel is None else link.channel for link in mine]
-    # Random channels by structure; none where all links are deterministic.
-    groups: dict[object, list[int]] = {}
-    if any(link.channel is not None or np.max(link.delay) < 1 for link in mine):
-        for i, channel in enumerate(channels):
-            groups.setdefault(structure(channel), []).append(i)
+    # None are random where all links are deterministic.
+    random = any(link.channel is not None or np.max(link.delay) < 1 for link in mine)
+    named = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
     # Received numbers of each node, and bounds on the quantizers' errors.
     received = tuple(link.received(n) for link in mine)
     error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
     return Uplinks(
-        groups=tuple(
-            _group([channels[i] for i in group], [nodes[i] for i in group], group) for group in groups.values()
-        ),
+        groups=channel_groups(named) if random else (),
         quantizers=stack(quantizers) if quantizers else None,
         links=_known([described(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
@@ -209,11 +198,6 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
         received=received,
         n=n,
     )
-
-
-def _group(channels: Sequence[Channel], names: Sequence[str], places: Sequence[int]) -> Group:
-    checksums = np.array([checksum(f"{name} to the fusion centre") for name in names], dtype=np.uint32)
-    return Group(stack(list(channels)), checksums, np.array(places))
 
 
 def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:

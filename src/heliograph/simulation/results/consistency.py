@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy.special import gammaincinv, ndtri
 
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.float64 import compiled
@@ -172,13 +172,13 @@ def consistency(
         means=by_step,
         intervals=every,
         autocorrelation=correlation,
-        autocorrelation_bound=float(stats.norm.ppf(quantiles[1]) / np.sqrt(present.sum())),
+        autocorrelation_bound=float(ndtri(quantiles[1]) / np.sqrt(present.sum())),
     )
 
 
 def _interval(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     """Quantiles of the mean of `count` values with so many degrees of freedom together."""
-    return np.asarray(stats.chi2.ppf(quantiles, degrees) / count) if count else np.full(2, np.nan)
+    return np.asarray(2 * gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
 def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:

@@ -15,7 +15,6 @@ from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees
-from heliograph.simulation.results.frames import record_fields, record_frame
 from heliograph.simulation.results.labelled import (
     TIME,
     check_title,
@@ -24,6 +23,8 @@ from heliograph.simulation.results.labelled import (
     dataset_of,
     filled,
     names_of,
+    record_fields,
+    record_frame,
     units_of,
     uplink_variables,
     uplinks_from,

@@ -1,4 +1,4 @@
-"""Reducers of simulated runs: sums and collected results, block by block inside the compiled scan."""
+"""Reducers of simulated runs: sums and collected results, step by step."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -44,27 +44,14 @@ class OfStep(NamedTuple):
 
 @readable
 class AbstractReducer(Module, Generic[Result]):
-    """Reduction of simulated runs: a carry that is summed over blocks, and a part that is collected.
+    """Reduction of simulated runs: numbers of each step that are summed over runs, and others that are collected.
 
-    A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes,
-    "estimates": of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name,
-    "uplinks"}, as `Network` has groups and kinds. What all runs share, such as a covariance, has length 1 along the
-    runs.
+    A step is {"truth": (n,), "measurements": (node, received) of each group of nodes, "estimates": of each kind an
+    `Estimate` with mean (filter, node, n), "fused": estimates by name, "uplinks"}, as `Network` has groups and kinds.
     """
 
-    def initial(self, shapes: PyTree) -> PyTree:
-        """Return the carry before the first block; `shapes` are those of a block."""
-        raise NotImplementedError
-
-    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Reduce a block inside the compiled scan: next carry and collected part; invalid runs are padding."""
-        raise NotImplementedError
-
     def of_step(self, step: PyTree) -> OfStep:
-        """Reduce one step of one run, for native code, which has no blocks.
-
-        `step` is as a block without its axes of runs and time. A reducer without this method is computed by XLA.
-        """
+        """Reduce one step of one run."""
         raise NotImplementedError
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
@@ -75,7 +62,7 @@ class AbstractReducer(Module, Generic[Result]):
         return ()
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
-        """Make the result; collected parts are joined along the run axis, without padding."""
+        """Make the result; collected parts are joined along the run axis."""
         raise NotImplementedError
 
     def joined(self, results: Sequence[Result], network: Network) -> Result:
@@ -91,16 +78,14 @@ class AbstractReducer(Module, Generic[Result]):
         raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
 
 
+def of_rows(reducer: AbstractReducer[Result], rows: PyTree) -> OfStep:
+    """Reduce a run from its steps (time, ...): stacked over time, but for flags that hold if true at any step."""
+    _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), rows)
+    return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
+
+
 class Trajectories(AbstractReducer[Record]):
     """Collect all trajectories; memory grows with the number of runs."""
-
-    def initial(self, shapes: PyTree) -> PyTree:
-        """Empty carry: nothing is summed."""
-        return ()
-
-    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
-        """Collect the block; each run gets its copy of what they share."""
-        return carry, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), batch)
 
     def of_step(self, step: PyTree) -> OfStep:
         """Collect the whole step."""

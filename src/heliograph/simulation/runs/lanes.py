@@ -8,19 +8,21 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.results.statistics import BATCHES
 
 BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 
+Progress = Callable[[int, int], None]
 Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs, carry -> carry, collected results
 
 
@@ -42,13 +44,6 @@ class Lanes:
         self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
         self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None
-
-    def blocks_of(self, runs: int) -> int:
-        """Number of blocks of a chunk of at least this many runs: fewer than there are lanes, or a multiple of them."""
-        blocks = -(-runs // BLOCK)
-        if blocks < self.count and not self.wide:
-            return blocks
-        return self.count * -(-blocks // self.count)
 
     def advance(self, start: int, blocks: int) -> PyTree:
         """Simulate `blocks` blocks from number `start` on; return what is collected, run by run, on the host."""
@@ -85,15 +80,52 @@ class Lanes:
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
-            with jax.enable_x64(True):
-                return to_numpy(reduce(_plus, [carry for carry in self.carries if carry is not None]))
-        return jax.tree.map(lambda leaf: reduce(np.add, np.asarray(leaf)), self.carries)
+            lanes = [carry for carry in self.carries if carry is not None]
+        else:
+            lanes = [jax.tree.map(lambda leaf: np.asarray(leaf)[lane], self.carries) for lane in range(self.count)]  # noqa: B023
+        with jax.enable_x64(True):
+            return to_numpy(reduce(added, lanes))
+
+
+class Shared(NamedTuple):
+    """A result that all runs share, among sums over runs."""
+
+    value: PyTree
+
+
+def is_shared(part: PyTree) -> bool:
+    """Test whether a part of the sums is common to all runs."""
+    return isinstance(part, Shared)
 
 
 @partial(jax.jit, donate_argnums=0)
-def _plus(total: PyTree, more: PyTree) -> PyTree:
+def added(total: PyTree, more: PyTree) -> PyTree:
     """Add in place: of many nodes these are hundreds of megabytes, which take longer to allocate than to add."""
-    return jax.tree.map(jnp.add, total, more)
+    return jax.tree.map(lambda a, b: b if is_shared(b) else a + b, total, more, is_leaf=is_shared)
+
+
+def in_chunks(
+    advance: Callable[[int, int], PyTree], lanes: int, wide: bool, runs: tuple[int, int], progress: Progress | None
+) -> list[PyTree]:
+    """Advance over all blocks; `runs`: their number, and that of a chunk, between which there is progress.
+
+    A chunk has fewer blocks than there are lanes, or a multiple of their number.
+    """
+    count, chunk = runs
+    blocks = -(-min(chunk, count) // BLOCK)
+    if blocks >= lanes or wide:
+        blocks = lanes * -(-blocks // lanes)
+    parts = []
+    for start in range(0, -(-count // BLOCK), blocks):
+        parts.append(advance(start, blocks))
+        if progress is not None:
+            progress(min((start + blocks) * BLOCK, count), count)
+    return parts
+
+
+def batch_counts(first_run: int, stop: int) -> np.ndarray:
+    """Number of runs of each batch, (batch,)."""
+    return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
 def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:

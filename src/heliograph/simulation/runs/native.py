@@ -22,7 +22,7 @@ from heliograph.codegen.program import Program, Summed
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.smoothed import Smoother, one_run
+from heliograph.simulation.smoothed import Smoother, reduced_run
 from heliograph.simulation.world import World
 
 PROGRAMS = 64  # whose code is held at once
@@ -46,8 +46,6 @@ def native(
     Raises:
         Unsupported: a program that native code does not support.
     """
-    if type(reducer).of_step is AbstractReducer.of_step:
-        raise Unsupported(f"{type(reducer).__name__}, which has no of_step")
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
     # Arrays are arguments; everything else is part of the program.
@@ -163,24 +161,13 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
 def _smoothed(
     world: World, later: Smoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
-    """Collect the results of a run's filtered and smoothed estimates, step by step, and its sums of the NIS."""
+    """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         return world.step(state, key, row)
 
-    def recorded(result: PyTree) -> OfStep:
-        _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), result)
-        return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
-
-    # The run with its smoother steps, then a backward pass.
     _, result = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    both = one_run(later.both, result)
-    filtered, smoothed = recorded(both["filtered"]), recorded(both["smoothed"])
-    return OfStep(
-        (filtered.sums, smoothed.sums, both["nis"]),
-        (filtered.ever, smoothed.ever),
-        (filtered.collected, smoothed.collected),
-    )
+    return reduced_run(reducer, later, result)
 
 
 def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:

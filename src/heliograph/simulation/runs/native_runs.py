@@ -1,6 +1,6 @@
 """Runs of a network by native code, block by block; a network of many nodes a few nodes at a time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import reduce
 from typing import Any
 
@@ -17,14 +17,13 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.reducer import AbstractReducer, Result
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.lanes import BLOCK, LANES
+from heliograph.simulation.runs.lanes import BLOCK, LANES, Progress, batch_counts, in_chunks
 from heliograph.simulation.runs.native import Native, native
-from heliograph.simulation.smoothed import Part, WithSmoothed
+from heliograph.simulation.smoothed import Part, Recorded, finished
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 
 NODES = 4  # simulated by one program: the plant is simulated again for each so many nodes, which costs a tenth
-Progress = Callable[[int, int], None]
 
 
 def natively(
@@ -43,20 +42,14 @@ def natively(
     Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
     nodes that share nothing but the plant: they are simulated a few at a time.
     """
-    # With smoothing: one program for filtered and smoothed estimates.
-    if part is not None:
-        both: WithSmoothed[Result] = WithSmoothed(reducer)
+    # Smoothing, few nodes, or nodes that share something: one program.
+    whole = part is not None or len(network.names) <= NODES or not _is_apart(network)
+    if whole or type(reducer).joined is AbstractReducer.joined:
         code = attempted(lambda: _code(network, inputs, key, reducer, part))
-        if code is None:
-            return None
-        return both.finished(*_recorded(code, both, first_run, runs, chunk, progress), network, part)
-    # Few nodes, or nodes that share something: one program.
-    if len(network.names) <= NODES or not _is_apart(network) or type(reducer).joined is AbstractReducer.joined:
-        code = attempted(lambda: _code(network, inputs, key, reducer))
         return (
             None
             if code is None
-            else reducer.finish(*_recorded(code, reducer, first_run, runs, chunk, progress), network)
+            else finished(reducer, _recorded(code, first_run, runs, chunk, progress), network, part)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
@@ -69,7 +62,7 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(reducer.finish(*_recorded(code, reducer, first_run, runs, chunk, shown), some))
+        results.append(finished(reducer, _recorded(code, first_run, runs, chunk, shown), some, None))
     return reducer.joined(results, network)
 
 
@@ -95,35 +88,19 @@ def _code(
     )
 
 
-def _recorded(
-    code: Native, reducer: AbstractReducer[Any], first_run: int, runs: int, chunk: int, progress: Progress | None
-) -> tuple[PyTree, PyTree]:
-    """Carry of the reducer after all runs, and what it collected of them, chunk by chunk."""
+def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
+    """Sums over all runs, and what is collected of them, chunk by chunk."""
     lanes = NativeLanes(code, first_run, first_run + runs)
-    blocks = lanes.blocks_of(min(chunk, runs))
-    parts = []
-    for start in range(0, -(-runs // BLOCK), blocks):
-        parts.append(lanes.advance(start, blocks))
-        if progress is not None:
-            progress(min((start + blocks) * BLOCK, runs), runs)
-    return lanes.total(reducer), lanes.joined(parts)
+    parts = in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
+    return lanes.total()._replace(collected=lanes.joined(parts))
 
 
 class NativeLanes:
-    """Blocks of runs dealt to lanes with separate sums: `Lanes` computed by native code.
-
-    Block j goes to lane j mod LANES whatever the number of cores, and each lane adds its blocks in order, so that
-    neither chunks nor cores change a bit of a result.
-    """
+    """Blocks of runs dealt to lanes with separate sums, computed by native code."""
 
     def __init__(self, code: Native, first_run: int, stop: int):
         self.code, self.first_run, self.stop = code, first_run, stop
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
-
-    def blocks_of(self, runs: int) -> int:
-        """Number of blocks of a chunk of at least this many runs: fewer than there are lanes, or a multiple of them."""
-        blocks = -(-runs // BLOCK)
-        return blocks if blocks < LANES else LANES * -(-blocks // LANES)
 
     def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
         """Simulate `blocks` blocks from number `start` on; return the collected results of their runs in order."""
@@ -143,8 +120,8 @@ class NativeLanes:
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
         return runs[runs < self.stop]
 
-    def total(self, reducer: AbstractReducer[Any]) -> PyTree:
-        """Carry of the reducer after all runs."""
+    def total(self) -> Recorded:
+        """Sums over all runs, by batch."""
         # Sums of the lanes, by batch.
         used = [sums for sums in self.sums if sums is not None]
         totals = iter([folded(reduce(np.add, parts), BATCHES) for parts in zip(*used, strict=True)])
@@ -156,9 +133,8 @@ class NativeLanes:
             value = next(totals) if is_summed else None
             leaves.append(item if shared else value)
             common.append(shared)
-        count = np.bincount(np.arange(self.first_run, self.stop) % BATCHES, minlength=BATCHES).astype(float)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return reducer.summed(sums, same, count)
+        return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
 
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Collected results of all runs, (run, ...); a view of one where they share it."""

@@ -20,8 +20,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.information_filter import Plants, updated
-from heliograph.planning.paths.model import Paths, error_covariances, path_information
+from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information, updated
 from heliograph.planning.paths.relaxation import envelope, split_paths
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step

@@ -1,7 +1,7 @@
 import numpy as np
 
-from heliograph.report.curves import Panel, curves_over, curves_over_time
-from heliograph.report.figures import BLUE, INK, Curve, svg
+from heliograph.report.figures import BLUE, INK, svg
+from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
 
 
 def test_each_panel_has_its_curves_and_names_them():

@@ -1,0 +1,125 @@
+"""Native code against XLA on random networks of the soak: the same numbers, failures and refusals.
+
+Run: python benchmarks/engines.py [COUNT]. What is done is kept in out/engines.jsonl, so that a later start goes on.
+Writes benchmarks/engines.json. Each network is simulated RUNS times by either engine with one seed.
+
+Differences are in units of the claimed deviation, and beyond 1e-12 of it only by the rounding of a number's own size: a
+state a million deviations from zero has six digits fewer than its error. What is NaN must be NaN under both. Singular
+covariances have no factor to more than half of the digits, and the weights of an intersection no minimum: there the
+engines differ by 1e-8 and more, and the file lists them.
+"""
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from soak import SEED, release
+from soak_networks import HORIZON, network
+
+import heliograph as hg
+
+HERE = Path(__file__).resolve().parent
+DONE, RESULTS = HERE.parent / "out" / "engines.jsonl", HERE / "engines.json"
+COUNT, RUNS = 300, 40
+DEVIATIONS, ROUNDINGS = 1e-12, 64 * np.finfo(float).eps  # of the claimed deviation, of a number's own size
+
+
+def simulated(item: hg.Network, index: int, engine: str) -> Any:
+    """The record by one engine, or the refusal in words."""
+    os.environ["HELIOGRAPH_ENGINE"] = engine
+    try:
+        return hg.monte_carlo(item, HORIZON, RUNS, index)
+    except ValueError as error:
+        return str(error)
+
+
+def excess(a: np.ndarray, b: np.ndarray, unit: np.ndarray | float, size: np.ndarray | float) -> float:
+    """Largest difference in what is allowed for it; infinite where one is no number and the other is."""
+    if not np.array_equal(np.isnan(a), np.isnan(b)):
+        return float("inf")
+    same = (a == b) | np.isnan(a)
+    with np.errstate(all="ignore"):
+        ratio = np.where(same, 0.0, np.abs(a - b) / (DEVIATIONS * unit + ROUNDINGS * size))
+    return float(np.max(np.where(np.isnan(ratio), np.inf, ratio), initial=0.0))
+
+
+def largest(x: np.ndarray) -> np.ndarray:
+    """Largest magnitude of each component in any run and step."""
+    return np.max(np.abs(np.where(np.isfinite(x), x, 0.0)), axis=(0, 1))
+
+
+def compared(native: Any, xla: Any) -> dict[str, float]:
+    """The largest excess of the truth, the measurements, and each filter's mean and covariance."""
+    truth = largest(xla.truth)
+    results = {"truth": excess(native.truth, xla.truth, 0.0, truth)}
+    for node, z in xla.measurements.items():
+        results[f"measurements of {node}"] = excess(native.measurements[node], z, 0.0, largest(z))
+    for node, filters in xla.estimates.items():
+        for name, b in filters.items():
+            a = native.estimates[node][name]
+            deviation = np.sqrt(np.abs(np.diagonal(b.covariance, axis1=-2, axis2=-1)))
+            size = np.maximum(truth, largest(b.mean))
+            results[f"{node}/{name}, mean"] = excess(a.mean, b.mean, deviation, size)
+            units, sizes = (x[..., :, None] * x[..., None, :] for x in (deviation, largest(deviation)))
+            results[f"{node}/{name}, covariance"] = excess(a.covariance, b.covariance, units, sizes)
+    return results
+
+
+def tried(index: int) -> dict[str, Any]:
+    """What is kept of one network."""
+    begun = time.perf_counter()
+    try:
+        item = network(index, SEED)
+    except ValueError as error:
+        return {"index": index, "refused": str(error), "seconds": 0.0}
+    native, xla = (simulated(item, index, engine) for engine in ("native", "xla"))
+    if isinstance(native, str) and native.startswith("native code:"):
+        result: dict[str, Any] = {"left to XLA": native}
+    elif isinstance(native, str) or isinstance(xla, str):
+        result = {"by native code": str(native), "by XLA": str(xla), "alike": native == xla}
+    else:
+        result = {"excess": compared(native, xla)}
+    return {"index": index, **result, "seconds": round(time.perf_counter() - begun, 2)}
+
+
+def main(count: int) -> int:
+    """Do what is not done, then sum up; 1 if the engines differ."""
+    warnings.simplefilter("ignore")
+    jax.config.update("jax_disable_most_optimizations", True)  # five steps of a few runs are not worth them
+    DONE.parent.mkdir(exist_ok=True)
+    key = release()
+    rows = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.exists() else []
+    rows = [row for row in rows if row["key"] == key]
+    left = sorted(set(range(count)) - {row["index"] for row in rows}, key=lambda i: (i % 36, i))
+    with DONE.open("a") as file:
+        for index in left:
+            rows.append(tried(index) | {"key": key})
+            file.write(json.dumps(rows[-1]) + "\n")
+            file.flush()
+            print(f"\r{len(rows)} of {count} networks", end="", file=sys.stderr)
+    worst = sorted(((x, row["index"], at) for row in rows for at, x in row.get("excess", {}).items()), reverse=True)
+    refused = [row for row in rows if "alike" in row]
+    result = {
+        "networks": len(rows), "runs": RUNS, "steps": HORIZON, "numbers compared": len(worst),
+        "within in every number": sum(max(row["excess"].values()) <= 1 for row in rows if "excess" in row),
+        "beyond what is allowed": sum(x > 1 for x, *_ in worst), "refused alike": sum(r["alike"] for r in refused),
+        "left to XLA": Counter(row["left to XLA"] for row in rows if "left to XLA" in row),
+        "refused by one": [r for r in refused if not r["alike"]], "worst": worst[:10],
+        "seconds": round(sum(row["seconds"] for row in rows), 1),
+    }  # fmt: skip
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    print(
+        f"\n{result['networks']} networks: {result['beyond what is allowed']} of {len(worst)} beyond, worst {worst[:1]}"
+    )
+    return int(result["beyond what is allowed"] > 0 or bool(result["refused by one"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else COUNT))

@@ -1,0 +1,104 @@
+"""Table of rows in slots: filters' states, their outputs and what they received, stepped from slot to slot."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliograph.live.history import History
+from heliograph.live.player import Player
+
+FEWEST = 1024  # rows of the table at first; it doubles when it is full
+SHORTEST = 64  # rows of a history
+
+
+class Pool:
+    """Table with one row per slot; slots are taken and given back.
+
+    The columns are (state, outputs, inputs held, step number, received, inputs, time). `numbers` is the slice of the
+    last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
+    """
+
+    def __init__(self, player: Player, alone: bool = False):
+        self.player, self.step_rows, self._alone = player, player.step_rows, alone
+        sizes = self.step_rows.state.size, self.step_rows.outputs.size
+        ends = np.cumsum([*sizes, player.given, 1, player.received + player.given + 1])
+        self.state, self.outputs, self.held, self.at, self.numbers = (
+            slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
+        )
+        self.table = np.zeros((FEWEST, int(ends[-1])))
+        self._free = list(range(FEWEST - 1, -1, -1))
+
+    @property
+    def used(self) -> int:
+        """Return how many slots are taken."""
+        return len(self.table) - len(self._free)
+
+    def take(self) -> int:
+        """Take a free slot."""
+        if not self._free:
+            count = len(self.table)
+            self.table = np.concatenate([self.table, np.zeros_like(self.table)])
+            self._free = list(range(2 * count - 1, count - 1, -1))
+        return self._free.pop()
+
+    def give(self, slots: list[int]) -> None:
+        """Give slots back."""
+        self._free += slots
+
+    def start(self, slot: int, time: float) -> None:
+        """Fill a slot with the prior, at `time`, before any measurement."""
+        row = self.table[slot]
+        row[:] = 0.0
+        row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, -1.0, np.nan
+        row[-1] = time
+
+    def trial(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
+        """Predict from the rows in these slots, with these inputs and no measurement; return the outputs.
+
+        The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
+        number is at most `last`.
+        """
+        dt, table = self.player.dt, self.table
+        u = np.where(np.isnan(given), table[before, self.held], given)
+        u = u if dt is None else np.insert(u, dt, 1.0, axis=1)
+        k = np.minimum(table[before, self.at.start] + 1, last)
+        nothing = np.full((len(before), self.player.received), np.nan)
+        done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
+        return done[:, self.step_rows.state.size :]
+
+    def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
+        """Step from the rows in the slots `before` into those in `after`; `at`: the step number in discrete time.
+
+        In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
+        received at the last of these.
+        """
+        dt, table = self.player.dt, self.table
+        numbers, held = table[after, self.numbers], table[before, self.held]
+        received, given = numbers[:, : self.player.received], numbers[:, self.player.received : -1]
+        now_held = np.where(np.isnan(given), held, given)
+        if dt is None:
+            there = (at == numbers[:, -1])[:, None]
+            received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
+            now_held, k = u, at
+        else:
+            u = np.insert(held, dt, numbers[:, -1] - table[before, -1], axis=1)
+            k = table[before, self.at.start] + 1
+        done = self.step_rows(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1), self._alone)
+        table[after, : self.outputs.stop] = done
+        table[after, self.held], table[after, self.at.start] = now_held, k
+
+    def reach(self, before: int, after: int) -> None:
+        """Step from the row in one slot into that in another, in discrete time through all steps between them."""
+        if self.player.dt is not None:
+            self.step(np.array([before]), np.array([after]), np.zeros(1))
+            return
+        for at in range(int(self.table[before, self.at.start]) + 1, int(self.table[after, -1]) + 1):
+            self.step(np.array([before]), np.array([after]), np.array([float(at)]))
+            before = after
+
+    def history(self, slots: Sequence[int]) -> History:
+        """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
+        length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
+        rows, steps = self.table[[*slots, *[slots[-1]] * (length - len(slots))]], self.step_rows
+        state, outputs = steps.state.tree(rows[:, self.state]), steps.outputs.tree(rows[:, self.outputs])
+        return History(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)

@@ -1,0 +1,207 @@
+"""Step of all filters of a network on rows of doubles: native code for many rows if possible, else XLA."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.codegen.engine import chosen
+from heliograph.live.static import Static, cast
+from heliograph.numerics.float64 import understood
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.judging import implausible, plausible_step, step_without
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters
+
+OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally"
+TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
+
+
+class Flat(NamedTuple):
+    """Layout of a tree whose leaves are concatenated in a row of doubles; integers are exact up to 2^53."""
+
+    structure: jax.tree_util.PyTreeDef
+    shapes: tuple[tuple[int, ...], ...]
+    kinds: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of a row."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    def tree(self, rows: jax.Array | np.ndarray) -> PyTree:
+        """Restore the tree from a row, or one with leading axes from rows (..., size), with the original dtypes."""
+        parts, begin = [], 0
+        for shape, kind in zip(self.shapes, self.kinds, strict=True):
+            end = begin + int(np.prod(shape))
+            parts.append(rows[..., begin:end].reshape((*rows.shape[:-1], *shape)).astype(kind))
+            begin = end
+        return self.structure.unflatten(parts)
+
+
+def flat_like(tree: PyTree) -> Flat:
+    """Return the layout of a tree of arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    return Flat(structure, tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves))
+
+
+def row_of(tree: PyTree) -> jax.Array:
+    """Concatenate the leaves of a tree of arrays in a row of doubles."""
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(leaf).astype(np.float64) for leaf in jax.tree.leaves(tree))])
+
+
+class NetworkStep(Module):
+    """Step of all filters of a network; `places` are the indices of each group's nodes in a row, (node, received)."""
+
+    filters: AllFilters
+    places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
+
+    def __init__(self, network: Network, filters: AllFilters):
+        rows = network.rows()
+        self.filters = filters
+        self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
+
+    def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
+        """Step all filters, without implausible measurements; return the states and the outputs.
+
+        The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
+        kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
+        """
+        after, result = plausible_step(self.filters, state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
+        """Step all filters with every measurement, implausible or not."""
+        after, result = self.filters.step(state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def without(
+        self, first: tuple[PyTree, PyTree], state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, PyTree]:
+        """Repeat the step, each filter without the measurements that it finds implausible."""
+        after, result = step_without(self.filters, first, state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def groups(self, received: jax.Array) -> list[jax.Array]:
+        """Return the measurements of each group's nodes, (node, received)."""
+        return [received[np.array(place, dtype=int)] for place in self.places]  # of nodes without a sensor none
+
+
+class Layout(NamedTuple):
+    """Structure of a network's step, and the columns of its rows: (state, received, inputs, step number)."""
+
+    static: Static
+    state: Flat
+    outputs: Flat
+    received: int
+    inputs: int
+
+    @property
+    def size(self) -> int:
+        """Length of a row before a step."""
+        return self.state.size + self.received + self.inputs + 1
+
+    def parts(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
+        """Return the filters' states, the measurements, the inputs and the step number of a row."""
+        known, rest = row[: self.state.size], row[self.state.size :]
+        u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
+        return self.state.tree(known), rest[: self.received], u, k
+
+
+class RowStep:
+    """A network's step as a function of rows, (state, received, inputs, step number) to (state, outputs).
+
+    No bit of a result depends on the other rows of a call. `state` and `outputs` are layouts of filters' states and of
+    their outputs.
+    """
+
+    def __init__(self, network: Network, filters: AllFilters, start: PyTree):
+        received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
+        numbers, static = cast(NetworkStep(network, filters))
+        data = numbers, start, np.zeros(received), np.zeros(inputs), np.asarray(0)
+        like = jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], *data)
+        self.state, self.outputs = flat_like(start), flat_like(like)
+        self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
+        self._layout = Layout(static, self.state, self.outputs, received, inputs)
+        self._numbers = [np.asarray(leaf) for leaf in numbers]
+        row = np.zeros((1, self._layout.size))
+        self._choice = chosen(_stepped(self._layout), (self._numbers, row), (False, True))
+
+    @property
+    def engine(self) -> str:
+        """Return which engine steps the filters, and why."""
+        return self._choice.explained
+
+    def program(self) -> str:
+        """Return the lowered step as text, which two processes compare to see that they compute the same."""
+        with jax.enable_x64(True):
+            lowered = jax.jit(_stepped(self._layout)).lower(self._numbers, np.zeros(self._layout.size))
+        return str(lowered.as_text())
+
+    def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
+        """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
+        if self._choice.code is not None:
+            result: np.ndarray = self._choice.code(*self._numbers, rows)
+            return result
+        width, together = (1, 1) if alone else (WIDTH, TOGETHER)
+        run = _by_xla(self._layout, width, together)
+        done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
+        for begin in range(0, len(rows), width):
+            count = min(width, len(rows) - begin)
+            filled[:count] = rows[begin : begin + count]
+            with jax.enable_x64(True):
+                result = run(self._numbers, filled, np.int32(-(-count // together)))
+            done[begin : begin + count] = np.asarray(result)[:count]
+        return done
+
+
+@lru_cache
+def _stepped(layout: Layout) -> Callable[[list[jax.Array], jax.Array], jax.Array]:
+    """Return the function of one row, the same one for layouts that are equal."""
+
+    def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
+        after, result = layout.static.filled(numbers).step(*layout.parts(row))
+        return jnp.concatenate([row_of(after), row_of(result)])
+
+    return step
+
+
+@lru_cache
+def _by_xla(layout: Layout, width: int, together: int) -> PyTree:
+    """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
+
+    def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
+        item: NetworkStep = layout.static.filled(numbers)
+
+        # One step with all measurements, and whether a filter finds one of them implausible.
+        def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
+            after, result = item.judged(*layout.parts(row))
+            return jnp.concatenate([row_of(after), row_of(result)]), implausible(result)
+
+        # The step again, for each filter without the measurements that it finds implausible.
+        def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
+            n = layout.state.size
+            first = layout.state.tree(stepped[:n]), layout.outputs.tree(stepped[n:])
+            return jnp.concatenate([row_of(part) for part in item.without(first, *layout.parts(row))])
+
+        # The second step is taken only if a row of the turn needs it.
+        def turn(i: jax.Array, done: jax.Array) -> jax.Array:
+            some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
+            stepped, bad = jax.vmap(judged)(some)
+            stepped = jax.lax.cond(
+                jnp.any(bad),
+                lambda: jnp.where(bad[:, None], jax.vmap(without)(some, stepped), stepped),
+                lambda: stepped,
+            )
+            return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
+
+        columns = layout.state.size + layout.outputs.size
+        stepped: jax.Array = jax.lax.fori_loop(0, turns, turn, jnp.zeros((width, columns)))
+        return stepped
+
+    return jax.jit(run, compiler_options=understood())
