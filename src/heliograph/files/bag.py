@@ -47,9 +47,9 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
     sources = Sources(table, network)
-    result = EventTable(network, sources.step)
+    events = EventTable(network, sources.step)
     with opened(path) as (reader, cut):
-        result.broken = cut
+        events.broken = cut
         counts = Counter[str]()
         for connection in reader.connections:
             counts[connection.topic] += connection.msgcount
@@ -63,23 +63,23 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
             for batch in batches(raw_messages(path, reader, used)):
-                if not decoder.add(batch, result):
-                    _add(path, reader, sources, batch, done, result)
+                if not decoder.add(batch, events):
+                    _add(path, reader, sources, batch, done, events)
                 done += len(batch)
                 if progress is not None:
                     progress(done, total)
         except InputError as error:
-            if not len(result):
+            if not len(events):
                 raise
-            result.broken = f"{error}; what was read before it stays"
+            events.broken = f"{error}; what was read before it stays"
     # Say which topics of either side were left out.
     rest = {topic: count for topic, count in counts.items() if topic not in used}
     if rest:
-        result.notes.append(f"{path}: not among the sources: {_counted(rest)}")
+        events.notes.append(f"{path}: not among the sources: {_counted(rest)}")
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
     if missing:
-        result.notes.append(f"{path}: not in the bag: {_listed(missing)}")
-    return result
+        events.notes.append(f"{path}: not in the bag: {_listed(missing)}")
+    return events
 
 
 @contextmanager

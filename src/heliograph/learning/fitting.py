@@ -174,13 +174,13 @@ def fit(
     identified = identified_by(surfaces[-1], points[0], seed)
     # climb each form from the best end of the one before
     for surface in surfaces:
-        result, stopped = _climbed(surface, points, say)
-        order = np.argsort(-np.nan_to_num(result.total, nan=-np.inf))
-        ends = result.total[order] if not len(ends) else ends
-        solutions.append(_solution(surface, result, int(order[0]), identified.ridges, say))
+        climbed, stopped = _climbed(surface, points, say)
+        order = np.argsort(-np.nan_to_num(climbed.total, nan=-np.inf))
+        ends = climbed.total[order] if not len(ends) else ends
+        solutions.append(_solution(surface, climbed, int(order[0]), identified.ridges, say))
         if stopped:
             break
-        points = result.x[order[:1]]
+        points = climbed.x[order[:1]]
     return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped)
 
 

@@ -78,12 +78,12 @@ def samples_to_tell(
     count = HORIZON if inputs is None else len(np.asarray(inputs))
     # mean and long-run deviation of the ratio under each law
     channels = [_with_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
-    results = []
-    for item, other in (channels, channels[::-1]):
-        ratio = _ratios(network, name, node, item, other, inputs, count, seed, nodes)
+    of_laws = []
+    for channel, alternative in (channels, channels[::-1]):
+        ratio = _ratios(network, name, node, channel, alternative, inputs, count, seed, nodes)
         deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
-        results.append((float(ratio.mean()), float(deviation)))
-    (gain_a, deviation_a), (gain_b, deviation_b) = results
+        of_laws.append((float(ratio.mean()), float(deviation)))
+    (gain_a, deviation_a), (gain_b, deviation_b) = of_laws
     # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2
     gain = gain_a + gain_b
     needed = (norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf

@@ -81,7 +81,7 @@ def lifted_modes(
     before = second_moments(moments, n + 1, degree)
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
-    parts, rounding, earlier = [], [], law
+    step_matrices, rounding, earlier = [], [], law
     distinct = {id(measurement): measurement for measurement in measurements}
     of_modes = {place: item.moments(degree) for place, item in distinct.items()}
     of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
@@ -105,10 +105,10 @@ def lifted_modes(
             noise = noise + p * (np.asarray(arrives) - matrix @ after @ matrix.T)
         output = np.concatenate(list(means), axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
-        parts.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
+        step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
         rounding.append(EPS * np.kron(law, np.diag(after)))
         before, rows = after, np.asarray(measurement.transition)
-    steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*parts, strict=True)))
+    steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*step_matrices, strict=True)))
     return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
 
 

@@ -81,17 +81,17 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             after = place._replace(hops=place.hops + 1)
             return visit(f"{place.prefix}hop{after.hops}", channel, place.signal), after
         case Series():
-            parts, place = _visit_chain(channel.maps, visit, place)
+            visited, place = _visit_chain(channel.maps, visit, place)
         case Stack():
             places = [Place(f"{place.prefix}part{i}.", 0, place.signal) for i in range(1, len(channel.maps) + 1)]
-            parts = [_visit(part, visit, at)[0] for part, at in zip(channel.maps, places, strict=True)]
+            visited = [_visit(part, visit, at)[0] for part, at in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
             several = isinstance(channel, Mixture) and sum(not is_silent(part) for part in channel.maps) > 1
             prefixes = [f"{place.prefix}choice{i}." for i in range(1, len(channel.maps) + 1)]
             places = [Place(prefix, 0, place.signal) if several else place for prefix in prefixes]
             pairs = [_visit(part, visit, at) for part, at in zip(channel.maps, places, strict=True)]
-            parts = [part for part, _ in pairs]
+            visited = [part for part, _ in pairs]
             place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
             return channel, place
@@ -108,9 +108,9 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
-    if all(part is before for part, before in zip(parts, channel.maps, strict=True)):
+    if all(part is before for part, before in zip(visited, channel.maps, strict=True)):
         return channel, place
-    return eqx.tree_at(lambda c: c.maps, channel, tuple(parts)), place
+    return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), place
 
 
 def _visit_chain(
