@@ -50,7 +50,7 @@ def test_a_table_of_statistics_claims_nothing_of_what_failed():
 
 
 def test_digits_that_a_prior_takes_leave_a_covariance_that_is_no_less_than_the_error():
-    """Two states tied to the last digit by a prior of 1e14: the second position leaves rounding alone, claimed as such."""
+    """Two states tied to the last digit by a prior of 1e14: the second position leaves rounding, claimed as such."""
     plant = hg.LinearPlant([[1, 1], [0, 1]], 1e-9, [0.0, 0.0], 1e14)
     sensor = hg.LinearSensor([[1, 0]], 1e-14)
     item = hg.linear_filter(plant, sensor, hg.perfect())
