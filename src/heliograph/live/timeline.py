@@ -55,8 +55,8 @@ class Timeline:
     - "late": it is before the base, in the order (time, node, sequence);
     - "duplicate": the same node, sequence and time are held with the same values; "conflict": with others, and the
       first stay;
-    - "implausible": no filter at the node could use it without losing its state or its digits (`heliograph.filters
-      .plausibility`), judged on what is held; or all its values are beyond the node's limits;
+    - "implausible": no filter at the node could use it without losing its state or its digits, judged on what is held
+      by `heliograph.filters.plausibility`; or all its values are beyond the node's limits;
     - "used".
 
     An event that is refused changes nothing. A plant with an input "dt" has continuous time, which starts at `start`;
