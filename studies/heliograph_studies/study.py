@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import re
+import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -179,9 +180,9 @@ class Study(Generic[Setting, Outcome]):
         if chosen is None:
             return None
         # Of the whole package: a study may compute with what another one defines.
-        root = import_module(self.compute.__module__.partition(".")[0])
-        file = Path(inspect.getfile(root))
-        paths = sorted(file.parent.rglob("*.py")) if hasattr(root, "__path__") else [file]
+        root = sys.modules.get((self.compute.__module__ or "").partition(".")[0])
+        file = Path(inspect.getfile(root or self.compute))
+        paths = sorted(file.parent.rglob("*.py")) if hasattr(root, "__path__") else [p for p in [file] if p.is_file()]
         source = b"".join(path.read_bytes() for path in paths)
         return f"{chosen} {hashlib.sha256(read + source).hexdigest()} {heliograph.__version__}"
 

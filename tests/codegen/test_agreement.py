@@ -245,6 +245,17 @@ def test_a_kernel_over_many_takes_what_they_share_from_memory_whole(length):
     np.testing.assert_allclose(result, x * row.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
+def test_numbers_read_as_others_of_fewer_bits_are_computed_by_xla():
+    """A double as two words, for a key, within each run and for many of them."""
+
+    def words(x):
+        return jax.lax.bitcast_convert_type(x, jnp.uint32)
+
+    x = RANDOM.normal(size=(3, 2))
+    assert engine_of(words, x).startswith("xla: bitcast from f64 to u32")
+    np.testing.assert_array_equal(hg.simulation.over_runs(words, x), x.view(np.uint32).reshape(3, 2, 2))
+
+
 def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypatch):
     def unknown():
         raise RuntimeError("no target for this processor")

@@ -1,6 +1,5 @@
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,6 @@ import pytest
 import heliograph as hg
 from heliograph.files.recording import read_recording as read_measurements
 from heliograph.learning import describe
-from heliograph.learning.likelihood import surface
 from heliograph.model.estimate import Estimate
 from heliograph_studies import demo
 from heliograph_studies.demo import compute as compute_module
@@ -38,10 +36,8 @@ def recording() -> PlazaRecording:
 
 
 @pytest.fixture(scope="module")
-def fit(recording: PlazaRecording) -> Iterator[hg.learning.Fit]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surface, "LANES", 1)  # the climb has one start: the others would stand by
-        yield first_half(recording)
+def fit(recording: PlazaRecording) -> hg.learning.Fit:
+    return first_half(recording)
 
 
 @pytest.fixture(scope="module")

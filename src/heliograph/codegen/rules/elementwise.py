@@ -88,10 +88,13 @@ def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     return graph.node("convert", type, x)
 
 
-def _bitcast(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    if type[1:] != x.type[1:]:
-        raise Unsupported(f"bitcast from {x.type} to {type}")
-    return x if x.type == type else graph.node("bitcast", type, x)
+def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Read numbers as others of as many bits."""
+    (x,), type = inputs, result_type(equation)
+    kinds = {n.type for n in x.ravel().tolist()}
+    if x.shape != result_shape(equation) or any(kind[1:] != type[1:] for kind in kinds):
+        raise Unsupported(f"bitcast from {', '.join(sorted(kinds))} to {type}")
+    return [array_of([n if n.type == type else lowering.graph.node("bitcast", type, n) for n in x.ravel()], x.shape)]
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
@@ -126,7 +129,7 @@ RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
     "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
     "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
-    "convert_element_type": _composed(_convert), "bitcast_convert_type": _composed(_bitcast),
+    "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
     "round": _composed(_round), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
