@@ -216,8 +216,11 @@ def link_names(app, doctree, page):
         text = node.astext().split("(")[0]
         name = text.rsplit(".", 1)[-1]
         known = objects.get(PLACES.get(name, ""))
+        root = text.split(".")[0]
+        # Another package's or object's, such as kf.rts_smoother.
+        foreign = "." in text and root not in ("hg", "heliograph") and root[:1].islower()
         plain = not text.startswith("hg.") and name.islower() and "_" not in name
-        if known and not plain and known.docname != page and re.fullmatch(r"[\w.]+", text):
+        if known and not plain and not foreign and known.docname != page and re.fullmatch(r"[\w.]+", text):
             address = f"{app.builder.get_relative_uri(page, known.docname)}#{known.node_id}"
             node.replace_self(nodes.reference("", "", node.deepcopy(), internal=True, refuri=address))
 

@@ -193,7 +193,7 @@ def _scanned(
 
 
 def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[str, PyTree]) -> PyTree:
-    """Smoothed results where that was asked for, and what the filters judged."""
+    """Return what the filters judged, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
     results = {name: part for name, part in results.items() if not name.startswith("weighed")}
