@@ -127,6 +127,14 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
     return carry[2]
 
 
+class Weighed(NamedTuple):
+    """Innovations by component: value, variance, and weight in the update, (..., m) each; NaN where none arrived."""
+
+    value: Array
+    variance: Array
+    weight: Array
+
+
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
 
@@ -168,7 +176,7 @@ class InnovationSummary(NamedTuple):
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {self.bias:.2g} +- {half:.1g}"
 
 
-def summarise_innovations(innovation: Innovation) -> tuple[InnovationSummary, ...]:
+def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]:
     """Summarise innovations over time, one output after the other.
 
     Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours: of
@@ -176,12 +184,9 @@ def summarise_innovations(innovation: Innovation) -> tuple[InnovationSummary, ..
     median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not hide.
 
     Args:
-        innovation: values (time, m) with covariance (time, m, m), NaN where nothing arrived, and weight (time, m).
+        innovations: value, variance and weight (time, m), NaN where nothing arrived.
     """
-    value = np.asarray(innovation.value)
-    variance = np.diagonal(np.asarray(innovation.covariance), axis1=-2, axis2=-1)
-    weight = np.ones_like(value) if innovation.weight is None else np.asarray(innovation.weight)
-    return tuple(_summary(*columns) for columns in zip(value.T, variance.T, weight.T, strict=True))
+    return tuple(_summary(*columns) for columns in zip(*(np.asarray(part).T for part in innovations), strict=True))
 
 
 def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.filters.innovation import InnovationSummary, Weighed, summarise_innovations
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -45,6 +46,7 @@ ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
 Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
 Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
 Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
+WeighedByFilter = TypeAliasType("WeighedByFilter", dict[str, dict[str, Weighed]])  # by node and filter
 
 
 @readable
@@ -64,6 +66,8 @@ class Record(Saved):
         reports: by fusion and node, of each fusion that uses reports.
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
             was sent, negative where it was lost, 0 where it was not sent.
+        weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
+            and their `weight` in the update, (time, received) each; `outputs` summarises them.
     """
 
     time: np.ndarray
@@ -76,6 +80,7 @@ class Record(Saved):
     smoothed: "Record | None" = None
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
+    weighed: WeighedByFilter = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take the units of states whose names have one; units given apart come first."""
@@ -158,6 +163,21 @@ class Record(Saved):
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
         return nees(np.asarray(self.truth), np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
+
+    def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
+        """Summarise the innovations of a filter that weighs, one output after the other.
+
+        Values received and down-weighted, their share with its interval, mean weight, bias with its interval, and mean
+        d^2, d an innovation in units of its deviation.
+
+        Raises:
+            ValueError: no such filter, one that weighs nothing, or a simulation, whose weights `filter.run` has.
+        """
+        self.check_filter(node, name)
+        if name not in self.weighed.get(node, {}):
+            weighing = [f"{element}/{of}" for element, filters in self.weighed.items() for of in filters]
+            raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
+        return summarise_innovations(self.weighed[node][name])
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
@@ -254,8 +274,7 @@ class Record(Saved):
 
     def apart(self) -> list[str]:
         """Names of the parts that are saved separately."""
-        there = {"reports": bool(self.reports), "transmissions": bool(self.transmissions)}
-        return super().apart() + [name for name, is_there in there.items() if is_there]
+        return super().apart() + [name for name in ("reports", "transmissions", "weighed") if getattr(self, name)]
 
     def plot(
         self,
