@@ -23,7 +23,7 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or a bag.")],
+    measurements: Annotated[Path, place("CSV or Parquet: rows or events; or a bag.")],
     out: Annotated[Path, place("Folder for fitted.json, fitted_network.py, figures and a page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
@@ -62,7 +62,10 @@ def fit(
 def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
+    from dataclasses import replace
+
     from heliograph.cli.run import read_mapped
+    from heliograph.files.events import event_table, holds_events
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.network_file import load_module
     from heliograph.files.recording import Recording, read_recording
@@ -80,6 +83,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
     messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
+    if messages is None and holds_events(measurements):
+        messages = event_table(measurements, start)
     recording = read_recording(measurements, start) if messages is None else messages.recording()
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
@@ -95,6 +100,7 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
 
     fitted = learn_from(build, early, starts=starts, seed=seed, progress=say)
     assert isinstance(fitted, Fit)  # since no sender decides
+    fitted = replace(fitted, delays={} if messages is None else messages.delays())
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
     judged = changes(start, fitted.network, recording.measurements, recording.inputs, cut) if cut < rows else []

@@ -196,18 +196,18 @@ def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np
     if not count:
         return InnovationSummary(len(value), 0, 0, wilson(0, 0), 0.0, *[float("nan")] * 5)
     # What counts as independent: neighbours that are alike say less.
-    independent = _independent(np.argsort(np.argsort(e)).astype(float))
+    independent = independent_count(np.argsort(np.argsort(e)).astype(float))
     # The median's interval holds the quantiles between which it lies with 95 %.
     reach = NORMAL / (2 * np.sqrt(independent))
     low, middle, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    doubted = _independent((w < HALF).astype(float))
+    doubted = independent_count((w < HALF).astype(float))
     share = wilson(down / count * doubted, doubted)
     numbers = (float(x) for x in (w.mean(), middle, low, high, d2.mean()))
     return InnovationSummary(len(value), count, down, share, doubted, *numbers)
 
 
-def _independent(values: Float[np.ndarray, " time"]) -> float:
-    """N (1 - a) / (1 + a), a the correlation of neighbours from 0 to 0.999; at least 1."""
+def independent_count(values: Float[np.ndarray, " time"]) -> float:
+    """Number of independent values that say as much, N (1 - a) / (1 + a), a the correlation of neighbours."""
     apart = values - np.mean(values)
     power = float(np.sum(apart**2))
     a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0
