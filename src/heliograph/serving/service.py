@@ -54,6 +54,9 @@ class OutputWriter:
         negative = place.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
         claim = place.claim if numbers and not negative else "none"
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        if place.tested is not None and judged is None:
+            nis, received = (outputs[column] for column in place.tested)
+            return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
         if judged is None:
             return results
         if place.weighed is not None:
