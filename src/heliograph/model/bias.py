@@ -71,6 +71,7 @@ def _gauss_markov(
     sizes = [scalar("deviation of a bias", x, 0.0) for x in _of_each("deviation of a bias", deviation, count)]
     rates = [_rate(x) for x in _of_each("time of a bias", time, count)]
     size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
+    # With a step that is a number, or as functions of the input that says it.
     xp = library(size, rate)
     start, center = xp.diag(size**2), np.zeros(count)
     if not isinstance(dt, str):
@@ -134,6 +135,7 @@ def _by_functions(
         moved = plant.transition(x[:n], u) + plant.noise_mean() + jnp.asarray(coupling) @ x[n:]
         return jnp.concatenate([moved, bias.transition(x[n:], pick @ u) + bias.noise_mean()])
 
+    # A linear plant stays one, unless its noise has a mean that a covariance by function cannot hold.
     means = [part.noise.mean for part in (plant, bias) if isinstance(part.noise, AbstractNoise)]
     if not isinstance(plant, LinearPlant) or not all(is_zero(mean) for mean in means):
         return Plant(move, spread, *start, states, plant.inputs, circular)
