@@ -1,6 +1,6 @@
 """`fit`: estimates of what is free in a network, with intervals, and sentences on what the data cannot tell."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, gathered, objectives
 from heliograph.learning.likelihood.surface import StoppedError, Surface
-from heliograph.learning.losses.delays import Delays, learn_delays
+from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
@@ -49,7 +49,7 @@ class Fit:
     identified: Identifiability
     ends: Float[np.ndarray, " starts"]
     stopped: bool
-    delays: Mapping[str, Delays] = field(default_factory=dict)
+    delays: DelaysByNode = field(default_factory=dict)
 
     @property
     def best(self) -> Solution:

@@ -1,6 +1,6 @@
 """Numbers of a sender that decides when to send, learned from what came and from what did not."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
 from heliograph.learning.likelihood.objective import gathered
-from heliograph.learning.losses.delays import Delays
+from heliograph.learning.losses.delays import DelaysByNode
 from heliograph.learning.solution import TWO_SIDED, Row
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -46,7 +46,7 @@ class SenderFit:
     total: float
     table: tuple[Row, ...]
     converged: bool
-    delays: Mapping[str, Delays] = field(default_factory=dict)
+    delays: DelaysByNode = field(default_factory=dict)
 
     @property
     def network(self) -> Network:

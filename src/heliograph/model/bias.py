@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs, Plant, matrix_of
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
@@ -13,15 +14,18 @@ from heliograph.numerics.traced import is_traced, is_zero, library, scipy_for
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
+Biases = TypeAliasType("Biases", Float[ArrayLike, " biases"])  # or one number for all
+OfBiases = TypeAliasType("OfBiases", Float[ArrayLike, "rows biases"])
+
 
 def with_bias(
     plant: "AbstractPlant",
     sensor: "AbstractSensor",
-    bias: "LinearPlant | Float[ArrayLike, ' biases']",
-    time: "Float[ArrayLike, ' biases']" = np.inf,
-    dt: "Float[ArrayLike, ''] | str" = 1.0,
-    coupling: "Float[ArrayLike, 'n biases'] | None" = None,
-    loading: "Float[ArrayLike, 'outputs biases'] | None" = None,
+    bias: "LinearPlant | Biases",
+    time: Biases = np.inf,
+    dt: "float | str" = 1.0,
+    coupling: "OfBiases | None" = None,
+    loading: "OfBiases | None" = None,
 ) -> "tuple[LinearPlant | Plant, LinearSensor | Sensor]":
     """Return plant and sensor with a bias b as further states: x+ = f(x, u) + E b + w, y = h(x) + D b + v.
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.filters.innovation import independent_count
 from heliograph.numerics.check import TINY, array, fail, scalar
@@ -11,6 +12,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import Discrete
+
+DelaysByNode = TypeAliasType("DelaysByNode", Mapping[str, "Delays"])
 
 
 @readable

@@ -42,11 +42,13 @@ if TYPE_CHECKING:  # extras
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
+Values = TypeAliasType("Values", np.ndarray)
+Units = TypeAliasType("Units", dict[str, str])  # by name
 ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
 Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
 Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
 Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
-WeighedByFilter = TypeAliasType("WeighedByFilter", dict[str, dict[str, Weighed]])  # by node and filter
+Weights = TypeAliasType("Weights", dict[str, dict[str, Weighed]])  # by node and filter
 
 
 @readable
@@ -70,17 +72,17 @@ class Record(Saved):
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
     """
 
-    time: np.ndarray
+    time: Values
     states: tuple[str, ...]
-    truth: np.ndarray | None
+    truth: Values | None
     measurements: ByNode
     estimates: Estimates
     uplinks: Uplinks = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
+    units: Units = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
-    weighed: WeighedByFilter = field(default_factory=dict)
+    weighed: Weights = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take the units of states whose names have one; units given apart come first."""
