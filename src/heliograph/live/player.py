@@ -96,7 +96,7 @@ class Player:
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)
         with jax.enable_x64(True):
-            filters = AllFilters(network, judges=True)
+            filters = AllFilters(network, judges=True, tests=True)
             for name, link in filters.reporting.items():
                 if link.uplinks.groups:
                     expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
