@@ -105,6 +105,7 @@ def recursive_design(
     check_choice("solver", solver, Solver)
     start = None if initial is None else _weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, separate)
+    # at the given level, or by bisection
     design = None if level is None else recursion.run(level, start)
     if design is not None and (design.feasible or not search):
         return design
