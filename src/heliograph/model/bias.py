@@ -64,7 +64,7 @@ def with_bias(
     if not isinstance(bias, LinearPlant):
         named = [f"{name}_bias" for name in sensor.outputs] if alone else [f"bias{i}" for i in range(seen.shape[1])]
         bias = _gauss_markov(plant, named, bias, time, dt)
-    return _driven(plant, bias, entering), _biased(sensor, seen, n)
+    return driven_by(plant, bias, entering), _biased(sensor, seen, n)
 
 
 def _gauss_markov(
@@ -91,7 +91,7 @@ def _gauss_markov(
     return LinearPlant(lambda u: jnp.diag(jnp.exp(-u[0] * rate)), fresh_in, center, start, states=names, inputs=[dt])
 
 
-def _driven(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
+def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """The plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
     n, parts = len(plant.states), (plant, bias)
     if set(bias.inputs) - set(plant.inputs):

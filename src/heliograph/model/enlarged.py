@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
 from heliograph.numerics.module import readable
@@ -134,7 +135,7 @@ def with_clocks(
     clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
     dt: "Float[ArrayLike, '']",
-) -> "tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]":
+) -> "tuple[LinearPlant | Plant | Clocked, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
@@ -165,7 +166,7 @@ def with_clocks(
     }
 
 
-def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Clocked:
+def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Plant | Clocked:
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
     # Independent initial offset and drift of each clock; drift is a random walk.
@@ -182,7 +183,7 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     if isinstance(plant, LinearPlant):
         center = library(start_at).stack([library(start_at).asarray(x) for x in start_at])
         drifting = LinearPlant(move, np.diag(wander), center, np.diag(spread), states=names)
-        return with_bias(plant, np.zeros((len(plant.states), len(move))), drifting)
+        return driven_by(plant, drifting, np.zeros((len(plant.states), len(move))))
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
     xp = library(plant.initial_mean, start_at)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # extras
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
-Values = TypeAliasType("Values", np.ndarray)
+Array = TypeAliasType("Array", np.ndarray)
 Units = TypeAliasType("Units", dict[str, str])  # by name
 ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
 Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
@@ -72,9 +72,9 @@ class Record(Saved):
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
     """
 
-    time: Values
+    time: Array
     states: tuple[str, ...]
-    truth: Values | None
+    truth: Array | None
     measurements: ByNode
     estimates: Estimates
     uplinks: Uplinks = field(default_factory=dict)
