@@ -160,6 +160,12 @@ def initial_size(item: HasStart) -> Float[jax.Array, " n"]:
     return seconds
 
 
+def state_rounding(size: Array) -> Float[jax.Array, "n *runs"]:
+    """Variance of each component of a mean by rounding alone, ((n + 2) eps)^2 E[x_i^2] of the state at the start."""
+    unit = (len(size) + 2) * float(np.finfo(size.dtype).eps)
+    return unit**2 * jnp.asarray(size)
+
+
 def output_rounding(matrix: Array, size: Array) -> Float[jax.Array, " m"]:
     """Deviation of H x by rounding alone, (n + 2) eps |H| root E[x x'] of the state at the start: (m,).
 
@@ -181,7 +187,6 @@ def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array) -> jax.A
 
     Shapes: after and prior (n, n), size (n,).
     """
-    unit = (len(after) + 2) * float(np.finfo(after.dtype).eps)
     left, whole = diagonal_of(after), diagonal_of(prior)
     precise = left < rounding(PRECISE, after, 1000) * whole
-    return after + diagonal(jnp.where(precise, jnp.minimum(unit**2 * size, whole), 0.0))
+    return after + diagonal(jnp.where(precise, jnp.minimum(state_rounding(size), whole), 0.0))
