@@ -119,7 +119,7 @@ def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"])
 
 T = TypeVar("T")
 HIGHEST = 31  # degree: C(62, 31) is below 2^63
-KEPT_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
+STORED_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 
 
 class Route(NamedTuple):
@@ -217,7 +217,7 @@ class Lifted:
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
         rows, columns = (count(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
-        small = not varies and rows * columns <= KEPT_ENTRIES
+        small = not varies and rows * columns <= STORED_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
         local = degrees(route.outputs, degree)

@@ -101,7 +101,7 @@ class Lanes:
         }
         central = {(FUSED, name): list(item) for name, item in outcome["weighed_centrally"].items() if item is not None}
         return {
-            place: WeighedAt(*(tuple(map(int, part)) for part in columns))
+            place: WeighedAt(*(tuple(map(int, column)) for column in columns))
             for place, columns in (parts | central).items()
         }
 

@@ -149,8 +149,8 @@ class SeparateChannels(AbstractMedium):
         return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
 
 
-def _first_mean(item: AbstractFilter) -> jax.Array:
-    return jnp.asarray(item.estimate(item.init()).mean)
+def _first_mean(filter: AbstractFilter) -> jax.Array:
+    return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
 def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:

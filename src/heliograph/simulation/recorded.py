@@ -18,7 +18,7 @@ from heliograph.simulation.judging import any_implausible, doubts, forbidden_row
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, smoothed_part, with_truth
+from heliograph.simulation.smoothed import Smoother, record_of, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters, begun
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -101,7 +101,7 @@ def run(
             for name, mesh in filters.meshes.items()
         }
         outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
-    record = found_record(network, smoothing, outputs, clock)
+    record = record_of(network, smoothing, outputs, clock)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 

@@ -139,7 +139,7 @@ def _build(
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
-    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     # Moments of the channel, its memory ignored.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
@@ -149,7 +149,7 @@ def _build(
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     proved: Claim = "upper" if is_bounded(plant, sensor, channel) else "exact"
-    claim = proved if linear and trusted and not own_prior else "nominal"
+    claim = proved if linear and trusted and not prior_given else "nominal"
     return GaussianFilter(
         plant=plant,
         sensor=sensor,
