@@ -19,7 +19,7 @@ from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.names import offered
+from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
@@ -36,6 +36,7 @@ INSTEAD = {  # what other packages call what a filter does here
     "update": "filter.correct(state, z), or filter.step(state, z, u), which predicts too",
     "filter": "filter.run(z, u) for rows of measurements",
     "smooth": "hg.rts_smoother(filter, z, u)",
+    "gain": "hg.steady_state(plant, sensor).gain",
 }
 
 
@@ -66,12 +67,7 @@ class AbstractFilter(Module):
 
         def __getattr__(self, name: str) -> NoReturn:
             """Refuse an attribute that does not exist with what to write instead, or the names most like it."""
-            kind = type(self)
-            if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
-                object.__getattribute__(self, name)
-            public = {item: f"filter.{item}" for item in dir(kind) if not item.startswith("_")}
-            remedy = f"; write {INSTEAD[name]}" if name in INSTEAD else offered(name, public)
-            raise AttributeError(f"{kind.__name__} has no attribute {name!r}{remedy}")
+            refuse_attribute(self, name, INSTEAD)
 
     def init(self) -> PyTree:
         """Return the state of the filter before the first step."""

@@ -274,4 +274,4 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 def check_type(name: str, value: object, expected: type) -> None:
     """Refuse an object of another class, in one line."""
     if not isinstance(value, expected):
-        raise fail(name, f"a {expected.__name__}", shown(value))
+        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", shown(value))

@@ -68,7 +68,9 @@ def run(
     """
     check_process()
     instance("network", network, Network, "a Network")
-    network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
+    name = next(iter(network.nodes))
+    measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
+    network = network.restricted_to(measured)
     steps = len(np.asarray(next(iter(measurements.values()))))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")

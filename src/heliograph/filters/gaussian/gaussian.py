@@ -124,10 +124,15 @@ def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime
     return result
 
 
+def perfect_for(sensor: AnySensor) -> Channel:
+    """Return the channel that delivers all outputs of a sensor as they are."""
+    return perfect(len(instance("sensor", first(sensor), AbstractSensor, "a Sensor or LinearSensor").outputs))
+
+
 def _build(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: AbstractTransform,
     update: AbstractUpdate,
     initial_mean: ArrayLike | None,
@@ -137,6 +142,7 @@ def _build(
     # Checks, and the prior.
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
+    channel = perfect_for(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
@@ -170,7 +176,7 @@ def _build(
 def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: "AbstractTransform",
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
@@ -181,8 +187,8 @@ def gaussian_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, None for one that delivers everything as it is. The memory of a
+            channel is ignored: where it matters, the claim is nominal.
         transform: moments of a nonlinear function; a linear plant or sensor needs none.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
@@ -205,7 +211,7 @@ def gaussian_filter(
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -215,8 +221,8 @@ def cubature_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, by default all arrives as it is. The memory of a channel
+            is ignored: where it matters, the claim is nominal.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -235,7 +241,7 @@ def cubature_filter(
 def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -245,7 +251,7 @@ def extended_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter.
+        channel: from the sensor to the filter; by default all arrives as it is.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -316,5 +322,4 @@ def kalman_filter(
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
-    channel = perfect(len(first(sensor).outputs))
-    return gaussian_filter(plant, sensor, channel, Linearization(), None, initial_mean, initial_covariance)
+    return gaussian_filter(plant, sensor, None, Linearization(), None, initial_mean, initial_covariance)
