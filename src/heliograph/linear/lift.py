@@ -12,7 +12,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
-from heliograph.numerics.linalg import with_rounding
+from heliograph.numerics.linalg import spectral_radius, with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series
@@ -43,7 +43,7 @@ class SteadyMoments:
     """
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
-        rate = 1 - float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+        rate = 1 - spectral_radius(matrix)
         self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate
         n, places = len(matrix), position(len(matrix) + 1, order)
         self._powers = np.array(exponents(n + 1, order))[:, :n]

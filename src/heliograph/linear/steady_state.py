@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
+from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, own_units
+from heliograph.numerics.linalg import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise

@@ -99,10 +99,18 @@ class WeighedAt(NamedTuple):
     weight: tuple[int, ...]
 
 
+class TestedAt(NamedTuple):
+    """Columns of a fused estimate's squared innovation, and of how many numbers arrived."""
+
+    distance: int
+    arrived: int
+
+
 class Place(NamedTuple):
     """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 
-    `judgement` is None for a fusion rule, which receives no measurement; `weighed` of a filter that weighs nothing.
+    `judgement` is None for a fusion rule, which receives no measurement; `tested` has its squared innovation by what
+    its nodes receive, and is None for all others. `weighed` is None of a filter that weighs nothing.
     """
 
     node: str
@@ -112,6 +120,7 @@ class Place(NamedTuple):
     covariance: int
     judgement: JudgementAt | None
     weighed: WeighedAt | None
+    tested: TestedAt | None
 
 
 class Lanes:
@@ -141,7 +150,7 @@ class Lanes:
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)
         with jax.enable_x64(True):
-            filters = AllFilters(network, judges=True)
+            filters = AllFilters(network, judges=True, tests=True)
             for name, link in filters.reporting.items():
                 if link.uplinks.groups:
                     expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
@@ -170,9 +179,10 @@ class Lanes:
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
         judged, weighed = self._judged(result), self._weighed(result)
+        tested = {(FUSED, name): TestedAt(*map(int, item)) for name, item in result["tested"].items()}
         return tuple(
             Place(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
-                  judged[node].get(name), weighed.get((node, name)))
+                  judged[node].get(name), weighed.get((node, name)), tested.get((node, name)))
             for node, filters in self.claims.items()
             for name, claim in filters.items()
         )  # fmt: skip

@@ -49,7 +49,7 @@ class Sweep(Module):
     def start(self, history: History, row: jax.Array) -> PyTree:
         """Return the filters' states after a row of the history."""
         local, central, *_ = history.known(row)
-        return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}
+        return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
     def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""

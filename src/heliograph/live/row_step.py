@@ -18,7 +18,7 @@ from heliograph.simulation.judging import implausible, plausible_step, step_with
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
-OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally"
+OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
 
 

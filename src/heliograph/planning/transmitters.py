@@ -18,17 +18,16 @@ from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
+from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
 Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
-Hop = GainAndNoise | Faded
 
 
 class Signal(NamedTuple):
@@ -38,7 +37,7 @@ class Signal(NamedTuple):
     arrives: Scalar
 
 
-Visit = Callable[[str, Hop, Signal | None], AbstractRandomAffine]
+Visit = Callable[[str, AbstractHop, Signal | None], AbstractRandomAffine]
 
 
 class Place(NamedTuple):
@@ -49,13 +48,18 @@ class Place(NamedTuple):
     signal: Signal | None
 
 
-def transmits(hop: Hop) -> bool:
+def transmits(hop: AbstractHop) -> bool:
     """Decide whether a hop transmits, rather than passes its input on by a wire."""
-    return isinstance(hop, Faded) or not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
+    return not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
 
 
-def _gain_is_one(hop: GainAndNoise) -> bool:
-    return isinstance(hop.law, Constant) and not is_traced(hop.law.value) and float(hop.law.value) == 1.0
+def _gain_is_one(hop: AbstractHop) -> bool:
+    return (
+        isinstance(hop, GainAndNoise)
+        and isinstance(hop.law, Constant)
+        and not is_traced(hop.law.value)
+        and float(hop.law.value) == 1.0
+    )
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
@@ -75,7 +79,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
     """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
     match channel:
-        case GainAndNoise() | Faded():
+        case AbstractHop():
             if not transmits(channel):
                 return channel, place
             after = place._replace(hops=place.hops + 1)
@@ -173,7 +177,7 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Names of the transmitters, in order of appearance."""
     names: dict[str, None] = {}
 
-    def note(name: str, hop: Hop, signal: Signal | None) -> Hop:
+    def note(name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
         names.setdefault(name)
         return hop
 
@@ -224,7 +228,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
         # Powers in a mode; a transmitter that is not received there sends as in other modes.
         powers: dict[str, Scalar] = {}
 
-        def note(name: str, hop: Hop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> Hop:
+        def note(name: str, hop: AbstractHop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> AbstractHop:
             assert signal is not None and isinstance(hop, GainAndNoise)
             if not is_silent(hop):
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
@@ -268,11 +272,11 @@ def allocate(
 def _amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
 
-    def change(hop_name: str, hop: Hop, signal: Signal | None) -> Hop:
+    def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
-        result: Hop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
+        result: AbstractHop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
         return result
 
     return visit_hops(channel, change)

@@ -11,6 +11,7 @@ from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.linalg import spectral_radius
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
@@ -24,7 +25,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.second_moments import Propagated, gain_mask, propagate, propagate_own
+from heliograph.relays.second_moments import Propagated, gain_mask, propagate
 
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000
@@ -41,7 +42,7 @@ def periodic_steps(network: RelayNetwork) -> Steps:
     if steps_covered(network) is not None:
         raise fail("steady state", "a network that varies with its slots only", "parts that are OverTime")
     steps = network.steps(len(network.slots))
-    radius = float(np.max(np.abs(np.linalg.eigvals(steps.transition[0]))))
+    radius = spectral_radius(steps.transition[0])
     if radius >= 1:
         raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
     mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
@@ -202,8 +203,8 @@ def _growth(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array,
 def _solve_own_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
-    moments, change = _solve_steady(lambda m: propagate_own(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
-    return propagate_own(steps, moments), change
+    moments, change = _solve_steady(lambda m: propagate(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
+    return propagate(steps, moments), change
 
 
 def _solve_steady(

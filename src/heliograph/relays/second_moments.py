@@ -116,31 +116,22 @@ class Propagated(NamedTuple):
     power: Float[Array, "time senders"]
 
 
-def propagate_own(steps: Steps, start: Float[Array, "d d"]) -> Propagated:
-    """Each filter minimises its own next error; start is the covariance of eta at 0."""
+def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None) -> Propagated:
+    """Propagate the covariance of eta from `start`, under given gains, or with each filter's own best next error.
 
-    def single(moments: jax.Array, p: Steps) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        z, sent = step_moments(p, moments)
-        gain = own_gain(z, p)
-        after = correct(z, gain)
-        return after, (gain, after, sent.power)
+    Entries of given gains on rows that receive nothing are not used.
+    """
 
-    start = jnp.asarray(start)
-    _, (gains, moments, power) = jax.lax.scan(single, start, steps)
-    return Propagated(gains, jnp.concatenate([start[None], moments]), power)
-
-
-def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> Propagated:
-    """Given gains; entries of rows that receive nothing are not used."""
-
-    def single(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def single(moments: jax.Array, item: tuple[Steps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = item
         z, sent = step_moments(p, moments)
-        after = correct(z, gain * p.live)
-        return after, (after, sent.power)
+        used = own_gain(z, p) if gain is None else gain * p.live
+        after = correct(z, used)
+        return after, (used if gain is None else gain, after, sent.power)
 
-    start, gains = jnp.asarray(start), jnp.asarray(gains)
-    _, (moments, power) = jax.lax.scan(single, start, (steps, gains))
+    start = jnp.asarray(start)
+    items = (steps, None if gains is None else jnp.asarray(gains))
+    _, (gains, moments, power) = jax.lax.scan(single, start, items)
     return Propagated(gains, jnp.concatenate([start[None], moments]), power)
 
 

@@ -46,8 +46,8 @@ class FilterOutput(BaseModel):
         mean: estimated state, n numbers.
         covariance: n rows of n numbers; null if the filter claims no covariance.
         claim: what the covariance is: exact, upper, nominal or none.
-        nis: normalised innovation squared of the received measurement; null if nothing was received, and of a fusion of
-            estimates, which receives no measurement.
+        nis: normalised innovation squared of the received measurement, of a fusion of estimates that of what its nodes
+            received; null if nothing was received, or where a fusion has no such test.
         received: number of received components, the expected value of `nis`.
         implausible: reason why this filter alone did not use the measurement; empty if it did.
         outputs: of a filter that weighs, what it made of each received number; left out of all others.

@@ -52,11 +52,16 @@ class OutputWriter:
 
     def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
         n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
+        # Estimate, without a claim where it is no number.
         covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
         numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
         negative = place.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
         claim = place.claim if numbers and not negative else "none"
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
+        if place.tested is not None:
+            nis, received = (outputs[column] for column in place.tested)
+            return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
         if judged is None:
             return results
         if place.weighed is not None:

@@ -291,14 +291,15 @@ class Watch:
             }
 
     def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
-        """Return the check of each fusion of estimates, by the claims of what it fuses."""
+        """Return the check of each fusion of estimates that has no test of itself, by the claims of what it fuses."""
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():
             known = [(part, tests[part]) for part in parts if part in tests]
             doubted = ["/".join(part) for part, test in known if test.doubt()]
             numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
             local = {"doubt": bool(doubted), "by": doubted or ["/".join(part) for part, _ in known]}
-            rows += [{"node": FUSED, "filter": name, "claim": claim, **numbers, **local}] if known else []
+            if known and (FUSED, name) not in tests:  # else it has a test of itself
+                rows.append({"node": FUSED, "filter": name, "claim": claim, **numbers, **local})
         return rows
 
     def _warnings(
