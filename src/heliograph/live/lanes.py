@@ -131,7 +131,7 @@ class Lanes:
     no bit of an estimate depends on which other rows are stepped in the same call.
 
     `uneven` explains why the plant's intervals cannot be divided, "" if they can. Rows have `received` measurements and
-    `given` inputs, beside the time step `dt`, which is None where time counts steps.
+    `given` inputs without the time step, whose number among the inputs is `dt`; None where time counts steps.
 
     Args:
         network: the network, with at least one filter.
