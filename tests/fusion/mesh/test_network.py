@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.simulation.centres.mesh import mesh_of
