@@ -32,12 +32,12 @@ class Errors(NamedTuple):
 
 
 def errors_of(record: Record) -> list[Errors]:
-    """Compare each filter with the truth; nothing without one."""
+    """Compare each filter with the truth, the fused ones first; nothing without one."""
     if record.truth is None:
         return []
     known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
     results = []
-    for node, estimates in record.estimates.items():
+    for node, estimates in sorted(record.estimates.items(), key=lambda item: item[0] != FUSED):
         for name, estimate in estimates.items():
             values = record.nees(node, name)
             judged = ~np.isnan(values)

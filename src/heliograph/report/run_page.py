@@ -254,9 +254,9 @@ def _compared(health: Health) -> list[Text | Points]:
 
 
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture | Choice]:
-    # One row for each filter: size, correlation and p-value of its innovations.
+    # One row for each filter, fused ones first: size, correlation and p-value of its innovations.
     rows = []
-    for tested_filter in health.filters:
+    for tested_filter in sorted(health.filters, key=lambda item: item.node != FUSED):
         test, name = tested_filter.test, visible(f"{tested_filter.node}/{tested_filter.filter}")
         if test is None:
             rows.append([name, tested_filter.claim, "–", "–", "–"])
@@ -291,6 +291,14 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
         f"{item.node}/{item.filter}" for item in health.filters if item.white is not None and item.node not in drawn
     ]
     table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
+    # Fusions of estimates, which are in no row.
+    listed = {(item.node, item.filter) for item in health.filters}
+    fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
+    if fusions:
+        text += (
+            f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
+            "fuses are tested here, and itself on the live page of `heliograph serve`."
+        )
     return [Text([text]), table, *_chosen(pictures), *_not_drawn(left, "Their numbers are in the table.")]
 
 

@@ -84,11 +84,11 @@ class Unscented(AbstractTransform):
 def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: "Channel | None" = None,
+    channel: "Channel|None" = None,
     alpha: float = 1e-3,
-    beta: float = 2.0,
-    kappa: float = 0.0,
-    update: "AbstractUpdate | None" = None,
+    beta: float = 2,
+    kappa: float = 0,
+    update: "AbstractUpdate|None" = None,
     initial_mean: "Float[ArrayLike, ' n'] | None" = None,
     initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
 ) -> "GaussianFilter":
