@@ -70,7 +70,7 @@ def serve(
     # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    opened = store_of(network, store, parts, "" if node is None else f"-{node}")
+    opened = store_of(network, store, parts, node)
     loaded, module = load_module(network)
     settings = ServiceSettings(
         loaded,

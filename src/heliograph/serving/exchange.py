@@ -15,7 +15,7 @@ Moment = Callable[[Plant, float], float | str]
 
 
 class Exchange:
-    """What a node sends: at each step its estimate before it and its measurement, once, to every node that receives it.
+    """Messages of a node: each step's, of its estimate before the step and its measurement, once, to all that receive it.
 
     A step's message goes with the measurement; from a node without a sensor when anything of the step comes, and where
     a measurement is missing when the next step has begun. A message that is lost is lost: what neighbours claim stands.
@@ -27,8 +27,9 @@ class Exchange:
 
     def __init__(self, fleet: Fleet, moment: Moment):
         self.fleet, self._moment = fleet, moment
-        nodes = [(name, item) for name, item in fleet.network.fused.items() if isinstance(item, NodeFilter)]
-        self._name, self._node = nodes[0] if nodes else ("", None)
+        nodes = {name: item for name, item in fleet.network.fused.items() if isinstance(item, NodeFilter)}
+        self._name = next(iter(nodes), "")
+        self._node = nodes.get(self._name)
 
     def messages(self, plants: Iterable[Plant]) -> list[Output]:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
@@ -47,8 +48,8 @@ class Exchange:
         for i, row in enumerate(held[1:], 1):
             after = held[i + 1] if i + 1 < len(held) else None
             followed = after is not None and id(after) not in new and id(row) not in new
-            known = before.get(id(row), self._measured(row.events))
-            if (self._measured(row.events) or after is not None) and not (followed or known):
+            sent = followed or before.get(id(row), self._measured(row.events))
+            if (self._measured(row.events) or after is not None) and not sent:
                 due.append(row)
         return due
 
@@ -62,8 +63,8 @@ class Exchange:
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])
         before = central[self._name].before
-        own = row.numbers[: self._node.measured[0]]
-        values = np.concatenate([before.mean[0], np.ravel(before.covariance[0]), own]).tolist()
+        measurement = row.numbers[: self._node.measured[0]]
+        values = np.concatenate([before.mean[0], np.ravel(before.covariance[0]), measurement]).tolist()
         time = int(row.key[0])
         message = {"plant": plant.name, "node": network.names[0], "sequence": time, "values": values}
         body = to_json(message | {"time": self._moment(plant, row.key[0])}, inf_nan_mode="null")

@@ -158,14 +158,14 @@ class ServiceSettings:
                 )
 
 
-def store_of(network: str, given: str | None, parts: int | None, node: str = "") -> str | None:
+def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
     """Return the place of the store as requested, else a file in this folder named after the network and its node.
 
     None keeps no state. Processes that share parts must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
-    return f"{name_of(network)}{node}.db"
+    return f"{name_of(network)}{'' if node is None else f'-{word(node)}'}.db"
 
 
 def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:

@@ -135,7 +135,7 @@ def word(plant: str) -> str:
 
 
 def topic_of(topic: str, output: Output) -> str:
-    """Return where an output of the service at a topic goes; a message to a node, to the topic beside it."""
+    """Return the topic of an output of the service at `topic`; of a message to a node the input of its service."""
     if output.kind == "message":
         return "/".join([*topic.split("/")[:-1], word(output.to), "in", word(output.plant)])
     return f"{topic}/out/{output.kind}/{word(output.plant)}"

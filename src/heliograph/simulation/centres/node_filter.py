@@ -1,6 +1,6 @@
 """One node of a fusion between neighbours as a filter: its measurements are its sensor's and its neighbours' messages.
 
-What a node needs of the others is in their messages, so that each can run in a process of its own.
+What a node needs of the others is in their messages, so that each can run in another process.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,6 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predict
 from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import at
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
@@ -36,7 +35,7 @@ class NodeState(NamedTuple):
 
 
 class NodeFilter(AbstractSizedFilter):
-    """Filter of one node of a fusion between neighbours; of the mesh it has its own row and its neighbours' sensors.
+    """Filter of one node of a fusion between neighbours; of the mesh it has one row and the neighbours' sensors.
 
     The measurement is z of the node itself, then for each neighbour j the mean (n,) and covariance (n, n) of its
     estimate before the step and its z_j: NaN where the message did not come. Claim: as the fusion's, whatever comes.
@@ -94,9 +93,11 @@ class NodeFilter(AbstractSizedFilter):
             came.append(arrives)
         return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances)), jnp.stack(came)
 
-    def _after(self, before: MeshState, z: jax.Array, u: jax.Array, k: Step) -> NodeState:
+    def _after(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         sensed, all_nodes, came = self._parts(z, before)
-        now, _ = self.mesh.step(all_nodes, [part[None] for part in sensed], came[None, None], u, jnp.asarray(k))
+        now, _ = self.mesh.step(
+            all_nodes, [part[None] for part in sensed], came[None, None], jnp.asarray(u), jnp.asarray(k)
+        )
         return NodeState(before, u, now)
 
 
