@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.serving.brokers.url import address
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
 from heliograph.serving.running import ServiceSettings, of_node
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore

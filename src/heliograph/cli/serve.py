@@ -54,9 +54,9 @@ def serve(
     import json
 
     from heliograph.files.network_file import load_module
+    from heliograph.live.fleet import Options
     from heliograph.numerics.check import fail
     from heliograph.serving.brokers.url import address
-    from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
     from heliograph.serving.running import ServiceSettings, name_of, of_node, run, store_of

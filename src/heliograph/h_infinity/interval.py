@@ -17,7 +17,7 @@ Contraction = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Se
 ULPS = 4  # units in the last place: a library's sine or exponential is off by less than one, the arithmetic by a half
 MOVES = (
     "reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
-    "dynamic_slice", "gather", "pad", "split", "stack", "stop_gradient",
+    "dynamic_slice", "gather", "pad", "split", "stack", "unstack", "stop_gradient",
 )  # fmt: skip
 CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 

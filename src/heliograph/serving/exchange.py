@@ -5,17 +5,17 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from pydantic_core import to_json
 
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant import Plant
 from heliograph.live.rows import HeldRow
-from heliograph.serving.fleet import Fleet
 from heliograph.serving.output import Output
-from heliograph.serving.plant import Plant
 from heliograph.simulation.centres.node_filter import NodeFilter
 
 Moment = Callable[[Plant, float], float | str]
 
 
 class Exchange:
-    """Messages of a node: each step's, of its estimate before the step and its measurement, once, to all that receive it.
+    """Messages of a node: each step's, of its estimate before the step and its measurement, once, to its receivers.
 
     A step's message goes with the measurement; from a node without a sensor when anything of the step comes, and where
     a measurement is missing when the next step has begun. A message that is lost is lost: what neighbours claim stands.

@@ -14,13 +14,13 @@ from typing import Protocol
 
 from heliograph.files.sources import Source
 from heliograph.live.event import INPUTS
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import check_count, fail
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, Part, TakenOverError, connected, word
 from heliograph.serving.brokers.url import Address
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import Damage, InMemoryStore, StoreProtocol, identity
@@ -207,8 +207,8 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     async with _watched(settings) as look:
         lanes = Lanes(settings.network)
-        if lanes.player.uneven:
-            what = f"predictions depend on when others are asked for: {lanes.player.uneven}"
+        if lanes.uneven:
+            what = f"predictions depend on when others are asked for: {lanes.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
             await _alone(settings, lanes, look)
@@ -261,7 +261,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Open the store, with the snapshot and the plants to begin anew, and report its state."""
     if settings.store is None:
         return InMemoryStore()
-    from heliograph.serving.storage.plant_codec import Carrier
+    from heliograph.serving.storage.carrier import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)

@@ -13,15 +13,18 @@ from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, Verdict
+from heliograph.live.fleet import Finalised
+from heliograph.live.fleet import Fleet as Fleet
+from heliograph.live.fleet import Options as Options
+from heliograph.live.lanes import Lanes as Lanes
+from heliograph.live.lanes import Place, WeighedAt
+from heliograph.live.plant import Plant
+from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.fleet import Finalised, Fleet
-from heliograph.serving.lanes import Lanes, Place, WeighedAt
 from heliograph.serving.message import Message, Payload, read_message
 from heliograph.serving.output import Output
-from heliograph.serving.plant import Plant
-from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 

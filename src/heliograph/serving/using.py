@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.fleet import Fleet
+from heliograph.live.judging import Candidate, Judges
+from heliograph.live.plant import Link, Plant
 from heliograph.numerics.check import InputError
-from heliograph.serving.fleet import Fleet
-from heliograph.serving.judging import Candidate, Judges
 from heliograph.serving.message import Message, seconds
-from heliograph.serving.plant import Link, Plant
 
 
 class Outcome(NamedTuple):

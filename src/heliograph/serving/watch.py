@@ -13,7 +13,7 @@ from scipy.special import gammaincinv
 
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
-from heliograph.live.player import TIME_STEP
+from heliograph.live.lanes import TIME_STEP
 from heliograph.model.estimate import Claim
 from heliograph.numerics.types import unit_of
 from heliograph.report.outputs import RecentOutputs, output_row
