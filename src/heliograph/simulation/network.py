@@ -110,7 +110,7 @@ class Network(Module):
         # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            if node != SENSORLESS:
+            if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
                 check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
             for label, element in node.filters.items():
                 check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)

@@ -183,10 +183,8 @@ class AllFilters(Module):
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
         for name, mesh in sorted(self.meshes.items()):
-            happens = mesh.edges.lossless() if drawn is None else drawn[name]
+            happens = mesh.edges.lossless() if drawn is None else drawn[name]  # within a process nothing is lost
             flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
-            if drawn is None and mesh.edges.groups:
-                raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
             published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Tests of fused estimates, by what arrived after the last of them.
