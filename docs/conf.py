@@ -62,7 +62,7 @@ html_theme_options = {
     "footer_end": [],
     "pygments_light_style": "tango",
 }
-html_sidebars = {"which_filter": [], "index": [], "comparisons": []}
+html_sidebars = {"which_filter": [], "index": [], "comparisons": [], "coming_from": []}
 copyright = "the heliograph authors, MIT license"
 
 

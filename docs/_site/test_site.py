@@ -20,6 +20,7 @@ import heliograph
 SITE = Path(__file__).parents[2] / "out" / "docs"
 PAGES = sorted(path.relative_to(SITE).as_posix() for path in SITE.rglob("*.html") if "_static" not in path.parts)
 QUESTIONS = ["which_filter.html", "theory.html", "extend.html", "errata.html", "comparisons.html"]  # of a newcomer
+WORDS = ["UKF", "RTS", "NIS", "batch", "gating", "multi-rate", "missing", "late", "dropout"]  # typed into the search
 LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
 NOT_LOADED = {"canonical", "index", "search", "next", "prev", "author", "copyright"}
 
@@ -105,3 +106,14 @@ def test_a_page_loads_without_a_complaint(browser, page, width):
     assert [a for a in seen.requests if not a.startswith(("file:", "data:", "blob:"))] == []
     assert seen.errors == []
     assert seen.width <= width
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_the_search_leads_from_a_word_of_other_packages_to_a_page_that_has_it(browser, word):
+    browser.open(f"{(SITE / 'search.html').as_uri()}?q={word}")
+    finished = "document.querySelector('.search-summary')?.textContent.startsWith('Search finished')"
+    wait = f"new Promise(done => {{ const id = setInterval(() => {finished} && (clearInterval(id), done(0)), 50) }})"
+    browser.call("Runtime.evaluate", expression=wait, awaitPromise=True)
+    pages = "[...document.querySelectorAll('#search-results li a')].map(a => a.getAttribute('href')).join(' ')"
+    addresses = browser.call("Runtime.evaluate", expression=pages)["result"]["value"]
+    assert "coming_from.html" in addresses or "irregular.html" in addresses

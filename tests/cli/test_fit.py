@@ -133,3 +133,27 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
     content = json.loads((out / "fitted.json").read_text())
     assert content["stopped"] and "best so far" in content["sentences"][0]
     assert np.isfinite(list(content["values"].values())).all()
+
+
+def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, capsys):
+    command = [
+        "fit",
+        str(folder / "cart.py"),
+        "--truth",
+        "--starts",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+        "--measurements",
+    ]
+    assert main([*command, str(folder / "data.csv")]) == 2
+    expected = (
+        f"heliograph: {folder / 'data.csv'}: expected columns of the true states, truth.STATE, for --truth, got none"
+    )
+    assert capsys.readouterr().err.endswith(f"{expected}\n")
+    table = (folder / "data.csv").read_text().splitlines()
+    rows = [f"{row},{row.split(',')[1]}" for row in table[1:60]]
+    (tmp_path / "true.csv").write_text("\n".join([f"{table[0]},truth.x0", *rows]))
+    assert main([*command, str(tmp_path / "true.csv")]) == 0
+    forms = {row["form"] for row in json.loads((tmp_path / "out" / "fitted.json").read_text())["table"]}
+    assert forms == {"truth"}

@@ -7,6 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.h_infinity import design
+from heliograph_studies.h_infinity_fusion.levels import level_without_measurements
 from tests.h_infinity.h_infinity_problems import channel, linear_system, node
 from tests.oracles import h_infinity_fusion as paper
 
@@ -69,7 +70,7 @@ def test_smallest_levels_over_the_horizon(i):
 
 
 def test_the_recursion_cannot_look_ahead():
-    result = hg.h_infinity.smallest_recursive_level(node(0))
+    result = hg.h_infinity.recursive_design(node(0))
     np.testing.assert_allclose(result.level, 0.02696, rtol=5e-4)
     assert result.level > HORIZON[0]
     assert hg.h_infinity.certify_level(
@@ -108,7 +109,7 @@ def test_a_largest_eigenvalue_leaves_no_tie_open(i):
 
 @pytest.mark.slow
 def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
-    level = hg.h_infinity.smallest_recursive_level(node(0), "largest_eigenvalue").level
+    level = hg.h_infinity.recursive_design(node(0), objective="largest_eigenvalue").level
     np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
 
 
@@ -124,7 +125,7 @@ def test_a_second_solver_finds_the_same_level():
 
 @pytest.mark.slow
 def test_without_measurements_the_channel_plays_no_part():
-    closed = hg.h_infinity.level_without_measurements(node(0))
+    closed = level_without_measurements(node(0))
     np.testing.assert_allclose(closed, 0.029031, rtol=3e-5)
     zero = np.zeros((16, 2, 2))
     for system in (node(0), node(2), node(0, beta=(0.1, 0.2, 0.3)), node(0, beta=(1.0, 1.0, 1.0))):
@@ -227,7 +228,7 @@ def test_what_varies_over_time_and_what_does_not():
             lambda: hg.h_infinity.known_channel_design(node(0), 1.0),
             "channel of a closed-form design: expected gains that are certain",
         ),
-        (lambda: hg.h_infinity.level_without_measurements(linear_system()), "dynamics are all in f"),
+        (lambda: level_without_measurements(linear_system()), "dynamics are all in f"),
     ],
 )
 def test_bad_input(call, message):

@@ -7,12 +7,12 @@ from heliograph.linear.known_losses import (
     KnownLossSystem,
     certified_radius,
     find_gains,
-    long_run_law,
     lower_bound,
     operator,
-    spectral_radius,
     steady,
 )
+from heliograph.numerics.linalg import spectral_radius
+from heliograph.random_affine.modes import long_run_law
 from heliograph_studies.intermittent_observations import setting
 from heliograph_studies.intermittent_observations.mean_error import mean_error
 from tests.riccati import riccati

@@ -28,6 +28,7 @@ def fit(
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
+    truth: Annotated[bool, Parameter(help="Learn from the true states (columns truth.STATE).", negative="")] = False,
 ) -> None:
     """Learn the numbers that your own network marks as free by hg.free, with intervals and identifiability.
 
@@ -49,7 +50,7 @@ def fit(
     check_seed("--seed", seed)
 
     def work(advance: "Advance") -> "Learned":
-        return learn(network, measurements, starts, seed, share, advance)
+        return learn(network, measurements, starts, seed, share, advance, truth)
 
     learned = write_results(out, 6, work, lambda result: results(result, out, network))
     print(learned.fit)
@@ -59,7 +60,15 @@ def fit(
         print("heliograph: warning: stopped before the end; this is the best so far", file=sys.stderr)
 
 
-def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
+def learn(
+    network: str,
+    measurements: Path,
+    starts: int,
+    seed: int,
+    held_out: float,
+    advance: "Advance",
+    truth: bool,
+) -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
     from heliograph.cli.run import read_mapped
@@ -76,16 +85,20 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)
+    # The network as it starts, and the data.
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
     messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
     recording = read_recording(measurements, start) if messages is None else messages.recording()
+    if truth and recording.truth is None:
+        raise fail(f"{measurements}", "columns of the true states, truth.STATE, for --truth", "none")
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
+    true = None if recording.truth is None else recording.truth[:cut]
     early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
-                      recording.time[:cut])  # fmt: skip
+                      recording.time[:cut], true)  # fmt: skip
 
     # Progress by iterations of the search.
     def say(line: str) -> None:
@@ -93,7 +106,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
-    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    # The fit.
+    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
     assert isinstance(fitted, Fit)  # since no sender decides
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")

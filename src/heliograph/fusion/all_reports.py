@@ -12,8 +12,8 @@ from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
-from heliograph.fusion.weights import solve_known
-from heliograph.numerics.linalg import symmetrize, with_rounding
+from heliograph.fusion.weights import RANK
+from heliograph.numerics.linalg import pseudo_solve, rounding, symmetrize, with_rounding
 from heliograph.numerics.types import Float
 
 
@@ -148,14 +148,14 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     total = cross @ output.T + noise
     if state.spill is None:
         cross = jnp.where(present[:, None], cross, 0.0)
-        gain = solve_known(_of_present(present, total), cross).T
+        gain = pseudo_solve(_of_present(present, total), cross, rounding(0.0, total, RANK)).T
         covariance = symmetrize(with_rounding(state.covariance, nodes * n) - gain @ cross)
         return Knowledge(state.mean + gain @ unexpected, covariance, state.past, None), Expected(expected, total)
     # Gain for quantizers' errors as white noise of variance D^2 / 3.
     push = _quantized(state.past, present)
     cross = jnp.where(present[:, None], cross, 0.0)
     wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
-    gain = solve_known(_of_present(present, total + wide), cross).T
+    gain = pseudo_solve(_of_present(present, total + wide), cross, rounding(0.0, total, RANK)).T
     # Joseph form with that gain; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(state.mean)) - gain @ output
     covariance = symmetrize(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)

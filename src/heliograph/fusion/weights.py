@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, probabilities, shown
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.linalg import eigh, regular_solve, symmetrize
+from heliograph.numerics.linalg import pseudo_solve, regular_solve, rounding, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
@@ -52,7 +52,7 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     # U = P + E E' in these units.
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    result = solve_known(total, ones).T  # E' U^+
+    result = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
     weights = regular_solve(result @ ones, result).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
@@ -101,17 +101,6 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
     by_node = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
     return jnp.einsum("i,ab->aib", by_node, jnp.eye(n))
-
-
-def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) -> Float[jax.Array, "N q"]:
-    """U^+ B for a positive semidefinite U, by its correlation matrix; directions outside its range are skipped."""
-    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(total), 0.0))
-    scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
-    values, vectors = eigh(scale[:, None] * total * scale)
-    used = values > RANK * float(np.finfo(values.dtype).eps) * values[-1]
-    inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
-    root = scale[:, None] * vectors
-    return jnp.asarray((root * inverse) @ (root.T @ right))
 
 
 def weighted(weights: Float[jax.Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:

@@ -6,18 +6,15 @@ from .certificate import (
 )
 from .closed_form import (
     known_channel_design as known_channel_design,
-    level_without_measurements as level_without_measurements,
 )
 from .design import (
     HInfinityDesign as HInfinityDesign,
     horizon_design as horizon_design,
     recursive_design as recursive_design,
-    smallest_recursive_level as smallest_recursive_level,
 )
 from .growth_check import (
     GrowthFinding as GrowthFinding,
     check_growth as check_growth,
-    check_size as check_size,
 )
 from .system import (
     Growth as Growth,

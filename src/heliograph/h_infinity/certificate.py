@@ -11,7 +11,7 @@ from heliograph.numerics.check import array, fail, instance, items, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
-FINDINGS = "findings of check_growth or check_size"
+FINDINGS = "findings of check_growth"
 ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix whose diagonal is -1
 
 
@@ -72,7 +72,7 @@ def certify_level(
         weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
         multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~.
         level: gamma, a positive ratio of norms.
-        growth: results of `check_growth` or `check_size`; constants that none of them proves are listed as assumed.
+        growth: results of `check_growth`; constants that none of them proves are listed as assumed.
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.

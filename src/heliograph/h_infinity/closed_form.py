@@ -1,4 +1,4 @@
-"""H-infinity designs that need no solver: without measurements, and behind a channel whose gains are known."""
+"""H-infinity design that needs no solver, behind a channel whose gains are known."""
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -8,55 +8,9 @@ from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 
-ACCURACY = 1e-10  # relative, of a level found by bisection
 SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
 GREATEST = 1e100  # level of a closed form, whose square times squares of matrices doubles hold
 SLACK = 1e-6  # relative strictness that a closed form gives away, so that its certificate has a margin
-
-
-def level_without_measurements(system: GrowthSystem) -> float:
-    """Compute the smallest level that Theorem 1 proves for K = 0, the filter that ignores what it receives.
-
-    P+ = (I / lambda + [B; B][B; B]' / level^2)^-1 with the largest lambda for which
-    P - diag(0, M'M) - lambda diag(a^2 I, a~^2 I) stays positive; the channel plays no part. A design is worth its
-    measurements where its level is below this one.
-
-    Args:
-        system: a system from `growth_system` whose dynamics are all in f, with growth constants above zero.
-
-    Raises:
-        ValueError: a system with a linear part A, or with a growth constant of zero.
-    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with K = 0 (closed form not in the paper).
-    """
-    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    if np.any(system.transition):
-        raise fail("level without measurements", "a system whose dynamics are all in f", "one with a linear part A")
-    growth = np.stack([system.growth.state, system.growth.error], axis=1)
-    if np.any(growth == 0):
-        raise fail("level without measurements", "growth constants above zero", "a zero")
-    scale = np.repeat(growth, system.states, axis=1)
-    low, high = 0.0, 1.0
-    while not _survives(system, scale, high):
-        low, high = high, 2 * high
-    while high - low > ACCURACY * high:
-        middle = (low + high) / 2
-        low, high = (low, middle) if _survives(system, scale, middle) else (middle, high)
-    return high
-
-
-def _survives(system: GrowthSystem, scale: Float[np.ndarray, "steps _"], level: float) -> bool:
-    """Decide whether the recursion for K = 0 stays positive over the whole horizon at this level."""
-    n = system.states
-    weight = level**2 * system.initial_weight
-    for k in range(system.steps):
-        reduced = weight.copy()
-        reduced[n:, n:] -= system.target[k].T @ system.target[k]
-        multiplier = np.linalg.eigvalsh(reduced / np.outer(scale[k], scale[k]))[0]
-        if multiplier <= 0:
-            return False
-        both = np.concatenate([system.disturbance[k]] * 2)
-        weight = np.linalg.inv(np.eye(2 * n) / multiplier + both @ both.T / level**2)
-    return True
 
 
 def known_channel_design(

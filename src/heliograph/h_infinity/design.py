@@ -68,75 +68,51 @@ class HInfinityDesign(NamedTuple):
 
 def recursive_design(
     system: GrowthSystem,
-    level: float,
+    level: float | None = None,
     initial: "Float[ArrayLike, 'n+n n+n'] | None" = None,
     objective: Objective = "trace",
     solver: Solver = "clarabel",
     separate: bool = False,
     search: bool = True,
 ) -> HInfinityDesign:
-    """Design gains at a given level by one linear matrix inequality after another.
+    """Design gains by one linear matrix inequality after another, at a given level or at the smallest that succeeds.
 
-    Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved.
+    Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved. The smallest
+    level is larger than that of `horizon_design`: a recursion cannot look ahead.
 
     Args:
         system: the system, from `growth_system`.
-        level: gamma, a positive ratio of norms.
+        level: gamma, a positive ratio of norms; the smallest at which the recursion succeeds, to 1e-4 relative by
+            bisection, unless given.
         initial: P_0 (2n, 2n); the largest allowed, level^2 W, by default.
         objective: which P_s+1 to take: "trace" the smallest tr L (this and the next in coordinates of order one where
             no growth makes lengths comparable), "largest_eigenvalue" that of L and among those the smallest tr L,
             "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end.
         solver: "clarabel" (interior point) or "scs" (first order).
         separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative.
-        search: look for the smallest level if this one fails.
+        search: look for the smallest level if the given one fails.
 
     Raises:
-        ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape.
+        ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape,
+            no level given and none that works.
         ModuleNotFoundError: cvxpy or the solver is not installed.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    _check_level(level)
+    if level is not None and float(scalar("level", level)) <= 0:
+        raise fail("level", "a positive number", level)
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, separate)
-    design = recursion.run(level, start)
-    if design.feasible or not search:
+    # at the given level, or by bisection
+    design = None if level is None else recursion.run(level, start)
+    if design is not None and (design.feasible or not search):
         return design
-    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, level)
-    return design._replace(smallest_level=smallest)
-
-
-def smallest_recursive_level(
-    system: GrowthSystem,
-    objective: Objective = "trace",
-    solver: Solver = "clarabel",
-    separate: bool = False,
-    initial: "Float[ArrayLike, 'n+n n+n'] | None" = None,
-) -> HInfinityDesign:
-    """Find the smallest level at which the recursive design succeeds, to 1e-4 relative, by bisection.
-
-    It is larger than the level of `horizon_design`: a recursion cannot look ahead.
-
-    Args:
-        system: the system, from `growth_system`.
-        objective: which weight to take at each step, as in `recursive_design`.
-        solver: "clarabel" or "scs".
-        separate: one multiplier for each of f, f~, h, h~ in place of two.
-        initial: P_0 (2n, 2n); the largest allowed by default.
-
-    Raises:
-        ValueError: an unknown objective or solver, an initial weight of the wrong shape, or no level that works.
-        ModuleNotFoundError: cvxpy or the solver is not installed.
-    Source: H-infinity fusion over amplify-and-forward relays, Theorem 2.
-    """
-    instance("system", system, GrowthSystem, "a GrowthSystem")
-    check_choice("objective", objective, Objective)
-    check_choice("solver", solver, Solver)
-    start = None if initial is None else _weight(initial, system.states)
-    recursion = _Recursion(system, objective, solver, separate)
-    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, recursion.coordinates.unit)
+    guess = recursion.coordinates.unit if level is None else level
+    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, guess)
+    if design is not None:
+        return design._replace(smallest_level=smallest)
     if smallest is None:
         raise fail("smallest level", f"one below {SEARCH_LIMIT:g} times the norm of M", "none that works")
     return recursion.run(smallest, start)
@@ -299,8 +275,3 @@ def _smallest(works: Callable[[float], bool], guess: float) -> float | None:
         middle = float(np.sqrt(high * low))
         low, high = (low, middle) if works(middle) else (middle, high)
     return high
-
-
-def _check_level(level: float) -> None:
-    if float(scalar("level", level)) <= 0:
-        raise fail("level", "a positive number", level)

@@ -113,6 +113,7 @@ def check_growth(
     high: "Float[ArrayLike, ' n']",
     name: str = "f",
     seed: int = 0,
+    differences: bool = True,
 ) -> GrowthFinding:
     """Search a box for a function's largest slope, and for a pair or a proof that decides on a growth constant.
 
@@ -128,17 +129,28 @@ def check_growth(
         high: upper corner of the box (n,).
         name: the function's name in sentences; "f" by default.
         seed: seed of the search; 0 by default.
+        differences: False for the weaker condition on f itself, |f(x)| <= a |x|: pairs with 0, which has to be in the
+            box.
 
     Raises:
-        ValueError: a negative constant, a box of the wrong shape or upside down.
+        ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
     bottom, top = _check_box(constant, low, high)
     seed = check_seed("seed", seed)
     check_callable("function", function, "the state")
+    if not differences and (np.any(bottom > 0) or np.any(top < 0)):
+        raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
-    # largest slope: Sobol points, then random moves from the steepest
     starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
+
+    def with_zero(points: np.ndarray) -> np.ndarray:
+        return np.concatenate([points, np.zeros_like(points)], axis=1)
+
+    if not differences:
+        points = _climb(lambda x: tools.ratio(with_zero(x)), starts, bottom, top, random)
+        return _finding(name, constant, bottom, top, tools, points, with_zero(points), False)
+    # largest slope: Sobol points, then random moves from the steepest
     points = _climb(tools.slope, starts, bottom, top, random)
     # largest ratio: close pairs along the steepest directions, and pairs far apart
     move = tools.steepest(points) * NEARBY * tools.width / 2
@@ -147,45 +159,6 @@ def check_growth(
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
     pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
     return _finding(name, constant, bottom, top, tools, points, pairs, True)
-
-
-def check_size(
-    function: Function,
-    constant: float,
-    low: "Float[ArrayLike, ' n']",
-    high: "Float[ArrayLike, ' n']",
-    name: str = "f",
-    seed: int = 0,
-) -> GrowthFinding:
-    """Search a box for a point that breaks |f(x)| <= constant |x|, the weaker condition on f itself (pairs with 0).
-
-    Args:
-        function: f, from (n,) to (m,) or a number, written with jax.numpy.
-        constant: the growth constant a, not negative.
-        low: lower corner of the box (n,), which has to hold 0.
-        high: upper corner of the box (n,).
-        name: the function's name in sentences; "f" by default.
-        seed: seed of the search; 0 by default.
-
-    Raises:
-        ValueError: a negative constant, a box of the wrong shape, upside down or without 0.
-    Source: H-infinity fusion over amplify-and-forward relays, condition (2) with f(0) = 0.
-    """
-    bottom, top = _check_box(constant, low, high)
-    seed = check_seed("seed", seed)
-    check_callable("function", function, "the state")
-    if np.any(bottom > 0) or np.any(top < 0):
-        raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
-    tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
-    starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
-
-    def from_zero(points: np.ndarray) -> np.ndarray:
-        return tools.ratio(np.concatenate([points, np.zeros_like(points)], axis=1))
-
-    points = _climb(from_zero, starts, bottom, top, random)
-    return _finding(
-        name, constant, bottom, top, tools, points, np.concatenate([points, np.zeros_like(points)], axis=1), False
-    )
 
 
 def _check_box(

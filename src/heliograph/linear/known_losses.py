@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.recursion import solve_innovation
 from heliograph.numerics.check import fail
+from heliograph.numerics.linalg import pseudo_solve, spectral_radius
 from heliograph.numerics.types import Float, Int
 
 BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
@@ -59,15 +59,6 @@ class KnownLossSystem(NamedTuple):
         return np.array([p * (gains[s] @ r @ gains[s].T + self.process) for p, s, r in modes])
 
 
-def long_run_law(initial: Float[np.ndarray, "modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
-    """Return the average law of a chain's modes over a long time: that of the lazy chain (Pi + I) / 2."""
-    lazy = (chain + np.eye(len(chain))) / 2
-    for _ in range(60):
-        lazy = lazy @ lazy
-        lazy /= lazy.sum(axis=1, keepdims=True)
-    return np.asarray(initial @ lazy)
-
-
 def operator(system: KnownLossSystem, gains: KindGains) -> Float[np.ndarray, "N N"]:
     """U -> sum_i chain[i, j] F_i U_i F_i' on all entries; where modes are independent, that of the sum of all U."""
     n, modes = len(system.transition), len(system.chain)
@@ -78,11 +69,6 @@ def operator(system: KnownLossSystem, gains: KindGains) -> Float[np.ndarray, "N 
     if system.forgets:
         return np.asarray(np.tensordot(system.chain[0], squares, axes=1))
     return np.block([[system.chain[i, j] * squares[i] for i in range(modes)] for j in range(modes)])
-
-
-def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
-    """The largest modulus of an eigenvalue."""
-    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 
 def steady(system: KnownLossSystem, gains: KindGains, source: Parts) -> Parts:
@@ -184,7 +170,7 @@ def _improved(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
         v = parts[modes].sum(axis=0)
         r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
         cross = c @ v @ system.transition.T
-        results.append(solve_innovation(c @ v @ c.T + r, cross).T if len(c) else cross.T)
+        results.append(pseudo_solve(c @ v @ c.T + r, cross).T if len(c) else cross.T)
     return tuple(results)
 
 

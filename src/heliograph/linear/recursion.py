@@ -8,10 +8,9 @@ import numpy as np
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
-from heliograph.numerics.linalg import PRECISE, with_rounding
+from heliograph.numerics.linalg import PRECISE, pseudo_solve, spectral_radius, with_rounding
 from heliograph.numerics.types import Float
 
-RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
 SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way
 DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
 
@@ -38,7 +37,7 @@ def covariance_step(
     predicted = s.transition @ spread @ s.transition.T + s.process
     cross = s.output @ predicted
     total = cross @ s.output.T + s.noise
-    gain = solve_innovation(total, cross).T
+    gain = pseudo_solve(total, cross).T
     rounded = with_rounding(predicted, len(cross))
     local = np.diag(s.noise)
     if np.all(local >= 0) and np.any(local < PRECISE * np.diag(total)):  # P - G C P lost digits
@@ -50,17 +49,6 @@ def covariance_step(
     else:
         after = rounded - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
-
-
-def solve_innovation(innovation: Float[np.ndarray, "m m"], cross: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
-    """O^+ C for a positive semidefinite O, by its correlation matrix, so that units do not matter."""
-    deviation = np.sqrt(np.maximum(np.diag(innovation), 0.0))
-    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
-    values, vectors = np.linalg.eigh(scale[:, None] * innovation * scale)
-    used = values > RANK_TOLERANCE * values[-1]
-    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=used)
-    root = scale[:, None] * vectors
-    return np.asarray((root * inverse) @ (root.T @ cross))
 
 
 def nearest_covariance(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -127,7 +115,7 @@ def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool
     changes = [np.abs(a - b) for a, b in zip(after, before, strict=True)]
     if not any(np.any(change) for change in changes):
         return True
-    ratio = float(np.max(np.abs(np.linalg.eigvals(loop)), initial=0.0)) ** (2 * SPAN)
+    ratio = spectral_radius(loop) ** (2 * SPAN)
     if ratio >= 1:
         return False
     left = max(1.0, ratio / (1 - ratio))

@@ -219,18 +219,15 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
         wander += [0.0, clock.wander]
     # o+ = o + dt d, d+ = d.
     move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
+    names = [f"{name}_{part}" for name in clocks for part in ("offset", "drift")]
+    if isinstance(plant, LinearPlant):
+        center = library(start_at).stack([library(start_at).asarray(x) for x in start_at])
+        drifting = LinearPlant(move, np.diag(wander), center, np.diag(spread), states=names)
+        return with_bias(plant, np.zeros((len(plant.states), len(move))), drifting)
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
     xp = library(plant.initial_mean, start_at)
     center = xp.concatenate([plant.initial_mean - law.mean, xp.stack([xp.asarray(x) for x in start_at])])
-    states = (*plant.states, *(f"{name}_{part}" for name in clocks for part in ("offset", "drift")))
-    # Block-diagonal dynamics of (x, clocks).
-    if isinstance(plant, LinearPlant):
-        xp, n = library(plant.matrix, plant.input_matrix), len(plant.states)
-        others = np.zeros((n, len(move)))
-        matrix = xp.block([[plant.matrix, others], [others.T, move]])
-        driven = xp.concatenate([plant.input_matrix, np.zeros((len(move), len(plant.inputs)))])
-        return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs)
     return Clocked(
         base=plant,
         move=move,
@@ -238,7 +235,7 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
         initial_mean=center + start.mean,
         initial_covariance=start.covariance,
         deviation=start,
-        states=states,
+        states=(*plant.states, *names),
         inputs=plant.inputs,
     )
 

@@ -13,9 +13,9 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign
-from heliograph.planning.transmitters import Hop, Signal, transmitter_names, visit_hops
+from heliograph.planning.transmitters import Signal, transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise
+from heliograph.random_affine.combine import AbstractHop, GainAndNoise
 from heliograph.random_affine.law import GivenMoments
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -199,7 +199,7 @@ def _node(transmitter: str) -> str:
 def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
     """Channel in which a relay stands halfway of one hop."""
 
-    def change(hop_name: str, hop: Hop, signal: Signal | None) -> AbstractRandomAffine:
+    def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractRandomAffine:
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop
         first, second = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))

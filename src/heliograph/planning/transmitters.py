@@ -18,17 +18,16 @@ from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import stationary
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
+from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
 Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
-Hop = GainAndNoise | Faded
 
 
 class Signal(NamedTuple):
@@ -38,7 +37,7 @@ class Signal(NamedTuple):
     arrives: Scalar
 
 
-Visit = Callable[[str, Hop, Signal | None], AbstractRandomAffine]
+Visit = Callable[[str, AbstractHop, Signal | None], AbstractRandomAffine]
 
 
 class Place(NamedTuple):
@@ -49,13 +48,18 @@ class Place(NamedTuple):
     signal: Signal | None
 
 
-def transmits(hop: Hop) -> bool:
+def transmits(hop: AbstractHop) -> bool:
     """Decide whether a hop transmits, rather than passes its input on by a wire."""
-    return isinstance(hop, Faded) or not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
+    return not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
 
 
-def _gain_is_one(hop: GainAndNoise) -> bool:
-    return isinstance(hop.law, Constant) and not is_traced(hop.law.value) and float(hop.law.value) == 1.0
+def _gain_is_one(hop: AbstractHop) -> bool:
+    return (
+        isinstance(hop, GainAndNoise)
+        and isinstance(hop.law, Constant)
+        and not is_traced(hop.law.value)
+        and float(hop.law.value) == 1.0
+    )
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
@@ -75,7 +79,8 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
     """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
     match channel:
-        case GainAndNoise() | Faded():
+        # A hop that transmits is visited; a wire is not.
+        case AbstractHop():
             if not transmits(channel):
                 return channel, place
             after = place._replace(hops=place.hops + 1)
@@ -84,7 +89,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             visited, place = _visit_chain(channel.maps, visit, place)
         case Stack():
             places = [Place(f"{place.prefix}part{i}.", 0, place.signal) for i in range(1, len(channel.maps) + 1)]
-            visited = [_visit(part, visit, at)[0] for part, at in zip(channel.maps, places, strict=True)]
+            visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
             several = isinstance(channel, Mixture) and sum(not is_silent(part) for part in channel.maps) > 1
@@ -95,6 +100,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
             return channel, place
+        # What wraps a link: inside it.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
             inside = place
@@ -108,6 +114,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
+    # The same object where nothing has changed.
     if all(part is before for part, before in zip(visited, channel.maps, strict=True)):
         return channel, place
     return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), place
@@ -118,11 +125,11 @@ def _visit_chain(
 ) -> tuple[list[AbstractRandomAffine], Place]:
     """The changed maps of a series, each of which receives what comes through those before it."""
     parts, signal = [], place.signal
-    for i, part in enumerate(maps):
-        changed, place = _visit(part, visit, place._replace(signal=signal))
+    for i, affine in enumerate(maps):
+        changed, place = _visit(affine, visit, place._replace(signal=signal))
         parts.append(changed)
         if signal is not None and i + 1 < len(maps):
-            signal = Signal(_behind(part, signal.second), signal.arrives * _arrival(part))
+            signal = Signal(_behind(affine, signal.second), signal.arrives * _arrival(affine))
     return parts, place
 
 
@@ -134,7 +141,7 @@ def _arrival(channel: AbstractRandomAffine) -> Scalar:
         case Erasure():
             return plain(channel.arrival) * _arrival(channel.base)
         case Series():
-            return prod(_arrival(part) for part in channel.maps)
+            return prod(_arrival(affine) for affine in channel.maps)
         case Delayed():
             return _arrival(channel.link)
     raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
@@ -146,8 +153,8 @@ def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
         case Erasure():
             return _behind(channel.base, second)
         case Series():
-            for part in channel.maps:
-                second = _behind(part, second)
+            for affine in channel.maps:
+                second = _behind(affine, second)
             return second
         case Delayed():
             return _behind(channel.link, second)
@@ -173,7 +180,7 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Names of the transmitters, in order of appearance."""
     names: dict[str, None] = {}
 
-    def note(name: str, hop: Hop, signal: Signal | None) -> Hop:
+    def note(name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
         names.setdefault(name)
         return hop
 
@@ -224,7 +231,7 @@ def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Arra
         # Powers in a mode; a transmitter that is not received there sends as in other modes.
         powers: dict[str, Scalar] = {}
 
-        def note(name: str, hop: Hop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> Hop:
+        def note(name: str, hop: AbstractHop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> AbstractHop:
             assert signal is not None and isinstance(hop, GainAndNoise)
             if not is_silent(hop):
                 powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
@@ -268,11 +275,11 @@ def allocate(
 def _amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
     """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
 
-    def change(hop_name: str, hop: Hop, signal: Signal | None) -> Hop:
+    def change(hop_name: str, hop: AbstractHop, signal: Signal | None) -> AbstractHop:
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
-        result: Hop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
+        result: AbstractHop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
         return result
 
     return visit_hops(channel, change)

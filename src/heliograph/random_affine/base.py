@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
+from math import prod
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -129,48 +131,52 @@ class AbstractRandomAffine(Module):
         return generator.normal(size=self.inputs)
 
 
-class AbstractOfOne(AbstractRandomAffine):
-    """Random affine map made of one other, with its shapes, state and extremes unless it says otherwise."""
+class AbstractOfParts(AbstractRandomAffine):
+    """Random affine map made of independent others, whose moments are linear in the law of each."""
 
     @property
-    def inside(self) -> AbstractRandomAffine:
-        """The map that this one is made of."""
+    def parts(self) -> tuple[AbstractRandomAffine, ...]:
+        """The maps that this one is made of."""
         raise NotImplementedError
 
-    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of another."""
+    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of others."""
         raise NotImplementedError
-
-    @property
-    def outputs(self) -> int:
-        """Outputs of the map inside."""
-        return self.inside.outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of the map inside."""
-        return self.inside.inputs
 
     @property
     def erases(self) -> bool:
-        """True if the map inside erases."""
-        return self.inside.erases
-
-    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """State of the map inside."""
-        return self.inside.init(key)
+        """True if one of the parts erases."""
+        return any(part.erases for part in self.parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the same map made of each extreme of the map inside."""
-        return tuple(self.around(m) for m in self.inside.extremes())
+        """Return the same map made of each combination of the parts' extremes."""
+        return tuple(self.rebuilt(*parts) for parts in product(*(part.extremes() for part in self.parts)))
 
     def corner_count(self) -> int:
-        """Count of the map inside."""
-        return self.inside.corner_count()
+        """Product of the parts' counts."""
+        return prod(part.corner_count() for part in self.parts)
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the same map made of the one inside with its mean gain."""
-        return self.around(self.inside.mean_gain())
+        """Return the same map made of its parts with their mean gains."""
+        return self.rebuilt(*(part.mean_gain() for part in self.parts))
+
+
+class AbstractOfOne(AbstractOfParts):
+    """Random affine map made of one other, with its shapes and state unless it says otherwise."""
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the part."""
+        return self.parts[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the part."""
+        return self.parts[0].inputs
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the part."""
+        return self.parts[0].init(key)
 
 
 class AbstractWithBase(AbstractOfOne):
@@ -179,13 +185,13 @@ class AbstractWithBase(AbstractOfOne):
     base: eqx.AbstractVar[AbstractRandomAffine]
 
     @property
-    def inside(self) -> AbstractRandomAffine:
+    def parts(self) -> tuple[AbstractRandomAffine, ...]:
         """The base."""
-        return self.base
+        return (self.base,)
 
-    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the same map with another base."""
-        return replace(self, base=inside)
+        return replace(self, base=parts[0])
 
 
 class AbstractOfOneShape(AbstractRandomAffine):

@@ -27,6 +27,7 @@ from heliograph.numerics.check import (
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.law import drawn_index
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]
@@ -140,11 +141,11 @@ class MarkovChain(AbstractMemory):
 
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw the mode at the first use."""
-        return _chosen(jnp.asarray(self.initial), key)
+        return drawn_index(self.initial, key)
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
         """Draw the next mode."""
-        return _chosen(jnp.asarray(self.transition)[state], key)
+        return drawn_index(jnp.asarray(self.transition)[state], key)
 
     def nodes(self, degree: int) -> Nodes:
         """The modes."""
@@ -238,11 +239,6 @@ def _identity(name: str | None) -> str:
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))
     return uuid4().hex if name is None else f"named {name}"
-
-
-def _chosen(law: jax.Array, key: jax.Array) -> jax.Array:
-    """Invert the distribution function at a uniform draw."""
-    return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(law)[:-1])
 
 
 def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:

@@ -1,9 +1,9 @@
 """Maps made of maps: the atom, one random gain times a matrix plus noise; in series, mixed and stacked."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import reduce
 from itertools import product
-from math import prod
 
 import equinox as eqx
 import jax
@@ -14,7 +14,13 @@ from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.traced import library, placed, stacked
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractOfOneShape, AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import (
+    AbstractOfOneShape,
+    AbstractOfParts,
+    AbstractRandomAffine,
+    as_maps,
+    check_forgets,
+)
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import (
     Moments,
@@ -31,7 +37,24 @@ from heliograph.random_affine.moments.monomials import (
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
 
 
-class GainAndNoise(AbstractRandomAffine):
+class AbstractHop(AbstractRandomAffine):
+    """Random affine map z = g A y + n of a known matrix A and a noise n, whatever the law of its gain g is."""
+
+    matrix: eqx.AbstractVar[Matrix]
+    noise: eqx.AbstractVar[AbstractNoise]
+
+    @property
+    def outputs(self) -> int:
+        """Length of z."""
+        return int(self.matrix.shape[-2])
+
+    @property
+    def inputs(self) -> int:
+        """Length of y."""
+        return int(self.matrix.shape[-1])
+
+
+class GainAndNoise(AbstractHop):
     """Random affine map z = g A y + n with a scalar random gain g, a known matrix A and noise n, all independent.
 
     Args:
@@ -55,16 +78,6 @@ class GainAndNoise(AbstractRandomAffine):
         self.law = law
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
-
-    @property
-    def outputs(self) -> int:
-        """Length of z."""
-        return int(self.matrix.shape[-2])
-
-    @property
-    def inputs(self) -> int:
-        """Length of y."""
-        return int(self.matrix.shape[-1])
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw [[g A, n], [0, 1]]."""
@@ -149,15 +162,19 @@ def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | N
 Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
 
 
-class _Parts(AbstractRandomAffine):
+class AbstractOfMaps(AbstractOfParts):
     """Map made of several maps: its state is the tuple of theirs, and all of them move at each draw."""
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
 
     @property
-    def erases(self) -> bool:
-        """True if one of the maps erases."""
-        return any(m.erases for m in self.maps)
+    def parts(self) -> tuple[AbstractRandomAffine, ...]:
+        """The maps."""
+        return self.maps
+
+    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the same map made of others."""
+        return replace(self, maps=parts)
 
     @property
     def remembers(self) -> bool:
@@ -178,7 +195,7 @@ class _Parts(AbstractRandomAffine):
         return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
 
 
-class Series(_Parts):
+class Series(AbstractOfMaps):
     """Series of independent maps, z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k].
 
     Args:
@@ -217,10 +234,6 @@ class Series(_Parts):
                         self.maps[0].moments(order).matrix)  # fmt: skip
         return Moments(matrix, self.outputs, self.inputs, order)
 
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """All combinations of the parts' extremes: moments are linear in the law of each part."""
-        return tuple(Series(parts) for parts in product(*(m.extremes() for m in self.maps)))
-
     @cached
     def corner_moments(self, order: int) -> Corners:
         """Products of the parts' corners."""
@@ -230,14 +243,6 @@ class Series(_Parts):
             first = items.reshape(-1, *items.shape[2:])
         return first
 
-    def corner_count(self) -> int:
-        """Product of the parts' counts."""
-        return prod(m.corner_count() for m in self.maps)
-
-    def mean_gain(self) -> AbstractRandomAffine:
-        """Each part with its mean gain."""
-        return Series([m.mean_gain() for m in self.maps])
-
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:
     """The product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
@@ -246,7 +251,7 @@ def _after(second: jax.Array, first: jax.Array) -> jax.Array:
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
 
 
-class Mixture(AbstractOfOneShape, _Parts):
+class Mixture(AbstractOfOneShape, AbstractOfMaps):
     """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
 
     Args:
@@ -303,7 +308,7 @@ class Mixture(AbstractOfOneShape, _Parts):
 
     def corner_count(self) -> int:
         """Extreme weights times the product of the maps' counts."""
-        return len(self.choice.corners()) * prod(m.corner_count() for m in self.maps)
+        return len(self.choice.corners()) * super().corner_count()
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
@@ -315,7 +320,7 @@ class Mixture(AbstractOfOneShape, _Parts):
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)
 
 
-class Stack(_Parts):
+class Stack(AbstractOfMaps):
     """Stack of independent maps of the same y, outputs one above the other; moments are products of polynomials."""
 
     maps: tuple[AbstractRandomAffine, ...]
@@ -367,15 +372,3 @@ class Stack(_Parts):
         constant[-1] = 1.0  # 1^(order - |a|)
         coefficients = multiply(coefficients, degree, constant, powers[-1], variables)
         return coefficients
-
-    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """All combinations of the parts' extremes."""
-        return tuple(Stack(parts) for parts in product(*(m.extremes() for m in self.maps)))
-
-    def corner_count(self) -> int:
-        """Product of the parts' counts."""
-        return prod(m.corner_count() for m in self.maps)
-
-    def mean_gain(self) -> AbstractRandomAffine:
-        """Each part with its mean gain."""
-        return Stack([m.mean_gain() for m in self.maps])

@@ -32,13 +32,13 @@ class AbstractOfLine(AbstractOfOne):
         raise NotImplementedError
 
     @property
-    def inside(self) -> AbstractRandomAffine:
+    def parts(self) -> tuple[AbstractRandomAffine, ...]:
         """The map of the line."""
-        return self.line
+        return (self.line,)
 
-    def around(self, inside: AbstractRandomAffine) -> AbstractRandomAffine:
+    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return another map of the line, as late."""
-        return OfLine(inside, self.past)
+        return OfLine(parts[0], self.past)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the map of the line."""

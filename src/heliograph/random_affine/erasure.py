@@ -51,10 +51,8 @@ def arrived(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     match channel:
         case Erasure():
             return arrived(channel.base)
-        case Series():
-            return Series([arrived(part) for part in channel.maps])
-        case Stack():
-            return Stack([arrived(part) for part in channel.maps])
+        case Series() | Stack():
+            return channel.rebuilt(*map(arrived, channel.maps))
     raise fail("channel", "erasures of channels, not mixtures of them", type(channel).__name__)
 
 
@@ -81,12 +79,9 @@ def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
             results = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
             results.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
         # Losses of independent parts: probabilities multiply.
-        case Series():
-            results = reduce(lambda done, part: _joint(done, outcomes(part), _after), channel.maps[1:],
-                           outcomes(channel.maps[0]))  # fmt: skip
-        case Stack():
-            results = reduce(lambda done, part: _joint(done, outcomes(part), _others), channel.maps[1:],
-                           outcomes(channel.maps[0]))  # fmt: skip
+        case Series() | Stack():
+            join = _after if isinstance(channel, Series) else _others
+            results = reduce(lambda done, more: _joint(done, more, join), map(outcomes, channel.maps))
         case _:
             raise fail("channel with erasures", "erasures in series and stacks", type(channel).__name__)
     return [o for o in results if is_traced(o.probability) or o.probability > 0]

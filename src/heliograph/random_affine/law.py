@@ -26,6 +26,11 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
+def drawn_index(probabilities: Vector, key: jax.Array) -> jax.Array:
+    """Draw one of finitely many: invert the distribution function at a uniform draw."""
+    return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(jnp.asarray(probabilities))[:-1])
+
+
 @readable
 class AbstractLaw(Module):
     """A law of a real random gain, independent over time.
@@ -88,8 +93,7 @@ class Discrete(AbstractLaw):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Invert the distribution function at a uniform draw."""
-        edges = jnp.cumsum(jnp.asarray(self.probabilities))[:-1]
-        return jnp.asarray(self.values)[jnp.sum(jax.random.uniform(key, dtype=float) > edges)]
+        return jnp.asarray(self.values)[drawn_index(self.probabilities, key)]
 
     def moment(self, order: int) -> float | jax.Array:
         """Return sum_i p_i v_i^order."""

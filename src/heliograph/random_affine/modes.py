@@ -25,7 +25,7 @@ from heliograph.random_affine.base import (
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, known
+from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Stack, known
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.moments.lift import Lift
 from heliograph.random_affine.moments.monomials import Moments
@@ -131,7 +131,7 @@ class OneStepLate(AbstractWithBase):
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
 
 
-class Faded(AbstractModal):
+class Faded(AbstractHop, AbstractModal):
     """Drifting fading z = (mean + deviation c) A y + n, with c a standard Gaussian that drifts (`Autoregression`).
 
     Args:
@@ -165,16 +165,6 @@ class Faded(AbstractModal):
         self.deviation = scalar("deviation of the gain", deviation, 0.0)
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
-
-    @property
-    def outputs(self) -> int:
-        """Length of z."""
-        return int(self.matrix.shape[-2])
-
-    @property
-    def inputs(self) -> int:
-        """Length of y."""
-        return int(self.matrix.shape[-1])
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
         """The map with the gain mean + deviation c."""
@@ -275,18 +265,17 @@ def forgetful(channel: AbstractRandomAffine) -> AbstractRandomAffine:
 
 def mixed(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
     """One of the modes' maps, by a law (that of the long run unless given)."""
-    return Mixture(modes.maps, long_run(modes) if law is None else law)
+    in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
+    return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)
 
 
-def long_run(modes: JointModes) -> np.ndarray:
+def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
     """p (I + Pi)^n / 2^n for a large n: the mean of the laws of all steps, of a chain that goes in circles too."""
-    rows = (np.eye(len(modes.initial)) + np.asarray(modes.transition)) / 2
+    rows = (np.eye(len(chain)) + chain) / 2
     for _ in range(DOUBLINGS):
         rows = rows @ rows
         rows = rows / rows.sum(axis=1, keepdims=True)
-    law: np.ndarray = np.asarray(modes.initial) @ rows
-    law = law / law.sum()
-    return law
+    return np.asarray(initial @ rows)
 
 
 def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:

@@ -13,6 +13,7 @@ from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.law import drawn_index
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Number, Square, Vector
 
@@ -167,8 +168,7 @@ class Contaminated(AbstractNoise):
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the branch, then from it."""
         first, second = jax.random.split(key)
-        edges = jnp.cumsum(jnp.asarray(self.shares))[:-1]
-        branch = jnp.sum(jax.random.uniform(first, dtype=float) > edges)
+        branch = drawn_index(self.shares, first)
         factors = jnp.stack([jnp.asarray(Gaussian(r).factor) for r in self.covariances])
         return jnp.asarray(self.means)[branch] + factors[branch] @ jax.random.normal(
             second, self.mean.shape, dtype=float

@@ -21,7 +21,6 @@ from heliograph.relays.second_moments import (
     initial_moments,
     linear_maps,
     propagate,
-    propagate_own,
     step_moments,
 )
 
@@ -176,10 +175,7 @@ def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -
     return result
 
 
-_propagate_own = compiled(propagate_own)
-
-
-def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
+def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
     K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
@@ -190,7 +186,7 @@ def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    return as_design(network, _propagate_own(network.steps(horizon), start_moments(network)))
+    return as_design(network, _propagate(network.steps(horizon), start_moments(network)))
 
 
 def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Schedule:

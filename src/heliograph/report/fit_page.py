@@ -178,10 +178,15 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
         [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
         for row in learned.fit.table
     ]
-    caption = (
-        "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). **Form**: "
+    form = (
         "of the likelihood; the **conditional** one is sharper and counts where there is one, the **linear** one needs "
         "no more than second moments."
+    )
+    if learned.fit.best.form == "truth":
+        form = "the density of the **true** states under what the filter claims."
+    caption = (
+        "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). "
+        f"**Form**: {form}"
     )
     picture = Picture(
         drawings["estimates"],

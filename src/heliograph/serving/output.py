@@ -6,23 +6,25 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from heliograph.model.estimate import Claim
 
-Kind = Literal["provisional", "final", "refused"]
+Kind = Literal["provisional", "final", "refused", "message"]
 
 
 class Output(NamedTuple):
     """A line of JSON about a plant, to be published.
 
     Args:
-        number: running count of the outputs that are published exactly once; None for provisional estimates.
+        number: running count of the outputs that are published exactly once; None for others.
         plant: name of the plant.
-        kind: "provisional", "final" or "refused".
+        kind: "provisional", "final" or "refused"; "message" to the service of another node.
         body: the line of JSON, without newline.
+        to: the node to whose service a message goes.
     """
 
     number: int | None
     plant: str
     kind: Kind
     body: bytes
+    to: str = ""
 
 
 class WeighedOutputs(BaseModel):
@@ -46,8 +48,8 @@ class FilterOutput(BaseModel):
         mean: estimated state, n numbers.
         covariance: n rows of n numbers; null if the filter claims no covariance.
         claim: what the covariance is: exact, upper, nominal or none.
-        nis: normalised innovation squared of the received measurement; null if nothing was received, and of a fusion of
-            estimates, which receives no measurement.
+        nis: normalised innovation squared of the received measurement, of a fusion of estimates that of what its nodes
+            received; null if nothing was received, or where a fusion has no such test.
         received: number of received components, the expected value of `nis`.
         implausible: reason why this filter alone did not use the measurement; empty if it did.
         outputs: of a filter that weighs, what it made of each received number; left out of all others.

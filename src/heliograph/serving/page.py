@@ -75,7 +75,7 @@ def _dead(watch: Watch) -> Metric:
 
 
 def _fused(watch: Watch) -> Metric:
-    what = "1 if a filter whose estimates a fusion takes is doubted: a fusion of estimates has no innovation."
+    what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
     for row in watch.fused_rows(watch.nis):
         doubted.add_metric([str(row["filter"])], float(bool(row["doubt"])))

@@ -13,7 +13,7 @@ from scipy.special import gammaincinv
 
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
-from heliograph.live.player import TIME_STEP
+from heliograph.live.lanes import TIME_STEP
 from heliograph.model.estimate import Claim
 from heliograph.numerics.types import unit_of
 from heliograph.report.outputs import RecentOutputs, output_row
@@ -291,14 +291,15 @@ class Watch:
             }
 
     def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
-        """Return the check of each fusion of estimates, by the claims of what it fuses."""
+        """Return the check of each fusion of estimates that has no test of itself, by the claims of what it fuses."""
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():
             known = [(part, tests[part]) for part in parts if part in tests]
             doubted = ["/".join(part) for part, test in known if test.doubt()]
             numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
             local = {"doubt": bool(doubted), "by": doubted or ["/".join(part) for part, _ in known]}
-            rows += [{"node": FUSED, "filter": name, "claim": claim, **numbers, **local}] if known else []
+            if known and (FUSED, name) not in tests:  # else it has a test of itself
+                rows.append({"node": FUSED, "filter": name, "claim": claim, **numbers, **local})
         return rows
 
     def _warnings(
@@ -388,9 +389,9 @@ def watch_of(network: Network, title: str) -> Watch:
     """Return the observer of services of a network, whose name is `title`."""
     claims = network.claims()
     fused = {
-        name: (claims[FUSED][name], [(node, item.filter) for node in network.nodes_with(item.filter)])
-        for name, item in network.fused.items()
-        if isinstance(item, Fusion)
+        name: (claims[FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
+        for name, fusion in network.fused.items()
+        if isinstance(fusion, Fusion)
     }
     names: dict[tuple[str, str], Sequence[str]] = {
         (node, name): place.received_names for node, place in network.nodes.items() for name in place.filters

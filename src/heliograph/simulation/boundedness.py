@@ -14,21 +14,20 @@ from heliograph.linear.known_losses import (
     certified_radius,
     fastest_unseen,
     find_gains,
-    long_run_law,
     reached,
-    spectral_radius,
     steady,
 )
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.linalg import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
-from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.modes import joint_modes, long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -24,6 +24,7 @@ from heliograph.simulation.centres.centre import (
     Centre,
     CentreState,
 )
+from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, fused_innovations
 from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
@@ -47,6 +48,7 @@ class AllFilters(Module):
     centres: tuple[Centre | LinearisedCentre, ...]
     reporting: dict[str, Reporting]
     meshes: dict[str, Mesh]
+    tests: dict[str, FusedInnovation]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
@@ -54,11 +56,18 @@ class AllFilters(Module):
     smooths: bool = eqx.field(static=True)
     judges: bool = eqx.field(static=True)
 
-    def __init__(self, network: Network, smoothed_groups: Collection[int] | None = None, judges: bool = False):
+    def __init__(
+        self,
+        network: Network,
+        smoothed_groups: Collection[int] | None = None,
+        judges: bool = False,
+        tests: bool = False,
+    ):
         """Stack the filters of a network by structure.
 
         `smoothed_groups`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
-        `judges`: filters judge their data, and skip implausible data on request.
+        `judges`: filters judge their data, and skip implausible data on request. `tests`: fused estimates are tested by
+        what arrives at the next step.
         """
         self.smooths, self.judges = smoothed_groups is not None, judges
         # Filters of the nodes, by kind.
@@ -74,9 +83,10 @@ class AllFilters(Module):
             for kind, (g, names) in enumerate(network.kinds)
         )
         # Central filters, fusions, informed centres, centres with reports.
-        self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
+        self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
         self.reporting, self.meshes = _reporting(network), meshes_of(network)
+        self.tests = fused_innovations(network, self.alike) if tests else {}
         # Permutation of the groups' measurements into the order of the nodes.
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
@@ -86,13 +96,14 @@ class AllFilters(Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """Return states before the first step: of filters, central ones, quantizers, centres, reports, neighbours."""
+        """Return states before the first step: of filters, central ones, quantizers, centres, reports, tests."""
         central = {name: started(item) for name, item in self.central.items()}
         local = tuple(item.init() for item in self.alike)
-        sent = tuple(item.init(self.n) for item in self.fusions)
+        sent = tuple(fusion.init(self.n) for fusion in self.fusions)
         reporting: dict[str, PyTree] = {name: item.init() for name, item in self.reporting.items()}
-        reporting |= {name: item.init() for name, item in self.meshes.items()}
-        return local, central, sent, tuple(self._started(item, local) for item in self.centres), reporting
+        reporting |= {name: mesh.init() for name, mesh in self.meshes.items()}
+        tested = {name: test.start for name, test in self.tests.items()}
+        return local, central, sent, tuple(self._started(centre, local) for centre in self.centres), reporting, tested
 
     def _started(self, centre: Centre | LinearisedCentre, local: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
         means = [local[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
@@ -130,9 +141,10 @@ class AllFilters(Module):
         "reports" with their delays by fusion, as the nodes send them; if asked for, the smoother steps,
         "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
         "weighed" and "weighed_centrally" of those that weigh;
+        "tested": squared innovations of the fused estimates, by name.
         `skip` has the reasons of the same form not to use data.
         """
-        filter_states, central, quantizer_states, centre_states, reporting = states
+        filter_states, central, quantizer_states, centre_states, reporting, tested = states
         # The nodes' filters.
         reasons = [None] * len(filter_states) if skip is None else skip[0]
         stepped = [
@@ -171,21 +183,26 @@ class AllFilters(Module):
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
         for name, mesh in sorted(self.meshes.items()):
-            happens = mesh.edges.lossless() if drawn is None else drawn[name]
+            happens = mesh.edges.lossless() if drawn is None else drawn[name]  # within a process nothing is lost
             flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
-            if drawn is None and mesh.edges.groups:
-                raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
             published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
+        # Tests of fused estimates, by what arrived after the last of them.
+        distances = {
+            name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
+            for name, test in self.tests.items()
+        }
+        tested = {name: following_prior(fused[name]) for name in self.tests}
         # Next states and results.
         filter_states = tuple(state for state, _ in stepped)
         central = {name: state for name, (state, _) in received.items()}
-        following = filter_states, central, tuple(after), tuple(learned), published
+        following = filter_states, central, tuple(after), tuple(learned), published, tested
         outputs: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
         if self.smooths:
             outputs["smoother_steps"] = tuple(single.steps for _, single in stepped)
             outputs["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
+            outputs["tested"] = distances
             outputs["judged"] = tuple(single.judgement for _, single in stepped)
             outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
             outputs["weighed"] = tuple(single.weighed for _, single in stepped)
@@ -234,8 +251,8 @@ def _plan(
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
     """Plan these filters alone: it is one program, whatever a network's fusions are."""
 
-    def single(item: AbstractFilter, smooths: bool) -> AbstractFilter:
-        return planned_with_past(item, u) if smooths else item.planned(u)
+    def single(filter: AbstractFilter, smooths: bool) -> AbstractFilter:
+        return planned_with_past(filter, u) if smooths else filter.planned(u)
 
     planned = tuple(
         replace(item, filters=over_all(partial(single, smooths=item.smooths), item.count * item.nodes)(item.filters))
@@ -255,12 +272,12 @@ def plans(filters: AllFilters) -> bool:
 def _reporting(network: Network) -> dict[str, Reporting]:
     """Fusions by reports, each with its uplinks and its centre."""
     results = {}
-    for name, item in network.fused.items():
-        if isinstance(item, Fusion) and item.by_report:
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
-            places, mine = network.places(), network.nodes_with(item.filter)
-            sources, order = gathering(network, places, mine, item.filter)
-            uplinks = uplinks_of(item, mine, len(network.states))
+            places, mine = network.places(), network.nodes_with(fusion.filter)
+            sources, order = gathering(network, places, mine, fusion.filter)
+            uplinks = uplinks_of(fusion, mine, len(network.states))
             results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
     return results
 
@@ -311,7 +328,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
 def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
-    filters = {single: item for single, item in node.filters.items() if single == name}
+    filters = {single: filter for single, filter in node.filters.items() if single == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)
     return replace(node, filters=filters)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph_studies.event_triggered.rates import least_error, simulated_rate
 from heliograph_studies.event_triggered.setting import Setting, rooms
 from heliograph_studies.stages import Stages
 
@@ -125,15 +126,14 @@ def against_messages(setting: Setting) -> tuple[dict[str, dict[str, list[float]]
     curves, steps = {}, 60 * setting.hours
     for name, triggers in rules.items():
         results = [
-            hg.planning.simulated_rate(plant, sensor, hg.perfect(), rule, setting.runs, steps, setting.seed)
-            for rule in triggers
+            simulated_rate(plant, sensor, hg.perfect(), rule, setting.runs, steps, setting.seed) for rule in triggers
         ]
         curves[name] = {
             "messages": [60 * item.rate for item in results],
             "error": [float(np.sqrt(item.error[0])) for item in results],
         }
     rates = [count / 60 for count in curves["on change"]["messages"]]
-    return curves, [float(np.sqrt(hg.planning.least_error(plant, sensor, rate))) for rate in rates]
+    return curves, [float(np.sqrt(least_error(plant, sensor, rate))) for rate in rates]
 
 
 def messages_saved(curves: dict[str, dict[str, list[float]]]) -> float:

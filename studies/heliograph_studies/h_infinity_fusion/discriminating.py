@@ -66,7 +66,7 @@ def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     for node in structured.OUTPUTS:
         system = structured.system(node)
         results["horizon"][node] = hg.h_infinity.horizon_design(system, separate=True)
-        results["recursive"][node] = hg.h_infinity.smallest_recursive_level(system, separate=True)
+        results["recursive"][node] = hg.h_infinity.recursive_design(system, separate=True)
         results["zero_gain"][node] = without_gain(system, True)
     return results
 

@@ -46,7 +46,7 @@ def growth(outcome: Runs) -> Growth:
     side, last = np.full(2, RANGE), setting.steps - 1
     f = dynamics(last)
     whole = hg.h_infinity.check_growth(f, setting.growth, -side, side, f"f at s = {last}")
-    size = hg.h_infinity.check_size(f, setting.growth, -side, side, f"|f| at s = {last}")
+    size = hg.h_infinity.check_growth(f, setting.growth, -side, side, f"|f| at s = {last}", differences=False)
     return Growth(visited, whole, size, _secant(truth, estimates))
 
 

@@ -8,10 +8,12 @@ import numpy as np
 import heliograph as hg
 from heliograph.h_infinity.solver import Objective
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 from heliograph_studies.h_infinity_fusion.setting import NODES, Constant, Setting
 
 OBJECTIVES: tuple[Objective, ...] = ("trace", "log_determinant", "largest_eigenvalue")
 LARGER_GROWTH = 1.1
+ACCURACY = 1e-10  # relative, of a level found by bisection
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,57 @@ def node_designs(setting: Setting, node: int) -> NodeDesigns:
         paper,
         certify(system, paper),
         {o: design.failed_step for o, design in tried.items()},
-        {o: hg.h_infinity.smallest_recursive_level(system, o).level for o in OBJECTIVES},
+        {o: hg.h_infinity.recursive_design(system, objective=o).level for o in OBJECTIVES},
         horizon,
         certify(system, horizon),
         hg.h_infinity.horizon_design(system, separate=True),
         without_gain(system),
-        hg.h_infinity.level_without_measurements(system),
+        level_without_measurements(system),
     )
+
+
+def level_without_measurements(system: hg.h_infinity.GrowthSystem) -> float:
+    """Compute the smallest level that Theorem 1 proves for K = 0, the filter that ignores what it receives.
+
+    P+ = (I / lambda + [B; B][B; B]' / level^2)^-1 with the largest lambda for which
+    P - diag(0, M'M) - lambda diag(a^2 I, a~^2 I) stays positive; the channel plays no part. A design is worth its
+    measurements where its level is below this one.
+
+    Args:
+        system: a system from `growth_system` whose dynamics are all in f, with growth constants above zero.
+
+    Raises:
+        ValueError: a system with a linear part A, or with a growth constant of zero.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with K = 0 (closed form not in the paper).
+    """
+    if np.any(system.transition):
+        raise fail("level without measurements", "a system whose dynamics are all in f", "one with a linear part A")
+    growth = np.stack([system.growth.state, system.growth.error], axis=1)
+    if np.any(growth == 0):
+        raise fail("level without measurements", "growth constants above zero", "a zero")
+    scale = np.repeat(growth, system.states, axis=1)
+    low, high = 0.0, 1.0
+    while not _survives(system, scale, high):
+        low, high = high, 2 * high
+    while high - low > ACCURACY * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if _survives(system, scale, middle) else (middle, high)
+    return high
+
+
+def _survives(system: hg.h_infinity.GrowthSystem, scale: Float[np.ndarray, "steps _"], level: float) -> bool:
+    """Decide whether the recursion for K = 0 stays positive over the whole horizon at this level."""
+    n = system.states
+    weight = level**2 * system.initial_weight
+    for k in range(system.steps):
+        reduced = weight.copy()
+        reduced[n:, n:] -= system.target[k].T @ system.target[k]
+        multiplier = np.linalg.eigvalsh(reduced / np.outer(scale[k], scale[k]))[0]
+        if multiplier <= 0:
+            return False
+        both = np.concatenate([system.disturbance[k]] * 2)
+        weight = np.linalg.inv(np.eye(2 * n) / multiplier + both @ both.T / level**2)
+    return True
 
 
 def certify(

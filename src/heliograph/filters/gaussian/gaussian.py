@@ -125,10 +125,15 @@ def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime
     return result
 
 
+def perfect_for(sensor: AnySensor) -> Channel:
+    """Return the channel that delivers all outputs of a sensor as they are."""
+    return perfect(len(instance("sensor", first(sensor), AbstractSensor, "a Sensor or LinearSensor").outputs))
+
+
 def _build(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: AbstractTransform,
     update: AbstractUpdate,
     initial_mean: ArrayLike | None,
@@ -138,9 +143,10 @@ def _build(
     # Checks, and the prior.
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
+    channel = perfect_for(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
-    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     # Moments of the channel, its memory ignored.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
@@ -150,7 +156,7 @@ def _build(
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     proved: Claim = "upper" if is_bounded(plant, sensor, channel) else "exact"
-    claim = proved if linear and trusted and not own_prior else "nominal"
+    claim = proved if linear and trusted and not prior_given else "nominal"
     return GaussianFilter(
         plant=plant,
         sensor=sensor,
@@ -171,7 +177,7 @@ def _build(
 def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: "AbstractTransform",
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
@@ -182,8 +188,8 @@ def gaussian_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, None for one that delivers everything as it is. The memory of a
+            channel is ignored: where it matters, the claim is nominal.
         transform: moments of a nonlinear function; a linear plant or sensor needs none.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
@@ -206,7 +212,7 @@ def gaussian_filter(
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -216,8 +222,8 @@ def cubature_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, by default all arrives as it is. The memory of a channel
+            is ignored: where it matters, the claim is nominal.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -236,7 +242,7 @@ def cubature_filter(
 def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -246,7 +252,7 @@ def extended_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter.
+        channel: from the sensor to the filter; by default all arrives as it is.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -317,5 +323,4 @@ def kalman_filter(
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
-    channel = perfect(len(first(sensor).outputs))
-    return gaussian_filter(plant, sensor, channel, Linearization(), None, initial_mean, initial_covariance)
+    return gaussian_filter(plant, sensor, None, Linearization(), None, initial_mean, initial_covariance)

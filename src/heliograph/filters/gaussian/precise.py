@@ -119,26 +119,29 @@ class _Taken(NamedTuple):
     whole: jax.Array
 
 
-def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
+def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     """Roots and gains with one component more."""
     before, rounded, gain, whole = state
-    f = times_vector(transpose(before), item.row)
-    total = summed(f * f, 0) + item.variance
-    used = total > item.least
+    f = times_vector(transpose(before), component.row)
+    total = summed(f * f, 0) + component.variance
+    used = total > component.least
     safe = jnp.where(used, total, 1.0)
     shared = times_vector(before, f)
     column = jnp.where(used, shared / safe, 0.0)
-    noisy = item.variance > 0
-    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * item.variance, 1.0)), 0.0)
+    noisy = component.variance > 0
+    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * component.variance, 1.0)), 0.0)
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
-    news = item.number - times_vector(transpose(gain), item.row)
+    news = component.number - times_vector(transpose(gain), component.row)
     # A component of which P leaves nothing unknown corrects the mean's rounding, by the root of that alone.
-    g, reach = times_vector(transpose(rounded), item.row), times_vector(transpose(jnp.abs(rounded)), item.size)
+    g, reach = (
+        times_vector(transpose(rounded), component.row),
+        times_vector(transpose(jnp.abs(rounded)), component.size),
+    )
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
     corrects = ~used & (size > least)
     step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size, 1.0), column)
     rounded = rounded - step[:, None] * g[None]
-    whole = whole + step[:, None] * (item.number - times_vector(transpose(whole), item.row))[None]
+    whole = whole + step[:, None] * (component.number - times_vector(transpose(whole), component.row))[None]
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
 
 

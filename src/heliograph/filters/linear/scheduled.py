@@ -15,13 +15,12 @@ from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step
-from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import eigh
+from heliograph.numerics.linalg import pseudo_solve
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -205,14 +204,3 @@ class LinearSystemFilter(AbstractSizedFilter):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
         return plan(self, inputs, self.projection)
-
-
-def pseudo_solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:
-    """O^+ C as in heliograph.linear.recursion; rows of zeros (absent components) are skipped."""
-    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(innovation), 0.0))
-    scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
-    values, vectors = eigh(scale[:, None] * innovation * scale)
-    used = values > RANK_TOLERANCE * values[-1]
-    inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
-    root = scale[:, None] * vectors
-    return jnp.asarray((root * inverse) @ (root.T @ cross))

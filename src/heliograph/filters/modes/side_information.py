@@ -11,7 +11,6 @@ import numpy as np
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
-from heliograph.filters.linear.scheduled import pseudo_solve
 from heliograph.filters.modes.modal import (
     joined,
     mean_rounding,
@@ -29,7 +28,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import spread_of, symmetrize
+from heliograph.numerics.linalg import pseudo_solve, spread_of, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments

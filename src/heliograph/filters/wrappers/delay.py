@@ -15,7 +15,7 @@ from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.enlarged import with_past
+from heliograph.model.enlarged import with_bias, with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -23,13 +23,11 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
-from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, known
 from heliograph.random_affine.delay import Delayed, Relayed, of_line, sent
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.noise import Gaussian, Independent
 
 
 class AbstractPartFilter(AbstractSizedFilter):
@@ -174,18 +172,11 @@ def with_relays(
 
 def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
     """Enlarge the plant by the line of a relay, which shifts by one at each step."""
-    held, n = size * (1 + steps), len(plant.states)
-    xp, none = library(plant.matrix, plant.input_matrix), Gaussian(np.zeros((held, held)))
-    shift = np.kron(np.eye(1 + steps, k=-1), np.eye(size))
-    return LinearPlant(
-        xp.block([[plant.matrix, np.zeros((n, held))], [np.zeros((held, n)), shift]]),
-        Independent([plant.noise, none]),
-        xp.concatenate([plant.initial_mean - plant.deviation.mean, np.zeros(held)]),
-        Independent([plant.deviation, none]),
-        xp.concatenate([plant.input_matrix, np.zeros((held, len(plant.inputs)))]),
-        (*plant.states, *(f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size))),
-        plant.inputs,
-    )
+    held = size * (1 + steps)
+    names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
+    shift, nothing = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((held, held))
+    line = LinearPlant(shift, nothing, np.zeros(held), nothing, states=names)
+    return with_bias(plant, np.zeros((len(plant.states), held)), line)
 
 
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:

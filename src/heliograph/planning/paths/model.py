@@ -22,7 +22,7 @@ from heliograph.numerics.check import array, covariance, fail, instance, names, 
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
-from heliograph.planning.moments import moments_over, steady_moment
+from heliograph.planning.moments import moments_over, steady_covariance, steady_moment
 
 DOUBLINGS = 60
 CONVERGED = 1e-16  # relative change of the fixed point by a doubling: rounding
@@ -112,19 +112,13 @@ def adjoint(plants: Plants, information: Matrices, p: Matrices, weights: Matrice
 
 
 def _around_period(phi: Matrices, weights: Matrices) -> Float[np.ndarray, "n n"]:
-    """L = S + R' L R at a period's last step, R = Phi_last ... Phi_0: the Lyapunov equation, by doubling."""
+    """L = S + R' L R at a period's last step, R = Phi_last ... Phi_0: the Lyapunov equation."""
     total, product = weights[-1], np.eye(phi.shape[-1])
     for k, factor in enumerate(phi):
         product = factor @ product
         if k + 1 < len(phi):
             total = total + product.T @ weights[k] @ product
-    for _ in range(DOUBLINGS):
-        more = product.T @ total @ product
-        total = total + more
-        if np.abs(more).max() <= CONVERGED * np.abs(total).max():
-            break
-        product = product @ product
-    return np.asarray(total)
+    return np.asarray(steady_covariance(product.T, total))
 
 
 Powers = Float[np.ndarray, "time hop"]

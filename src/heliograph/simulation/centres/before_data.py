@@ -174,7 +174,7 @@ def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple
 def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     (centre,) = filters.informed
 
-    separate, _, _, known, _ = filters.init()
+    separate, _, _, known, *_ = filters.init()
     nodes, n = known[0].errors.bias.shape
     items = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
     start = separate, initial_factors(known[0].errors, items * len(u))
@@ -198,5 +198,5 @@ def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
             published |= {name: jnp.asarray(estimate.covariance) for name, estimate in result.items()}
         return (filters.followed(local, u_k, k), tuple(following)), published
 
-    local, _, _, known, _ = filters.init()
+    local, _, _, known, *_ = filters.init()
     return jax.lax.scan(body, (local, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]

@@ -47,7 +47,7 @@ class CentreFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> CentreState:
         """Return the state before any report."""
-        local, _, _, known, _ = self.filters.init()
+        local, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
         return CentreState(local, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
 

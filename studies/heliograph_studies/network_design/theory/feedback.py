@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.known_losses import spectral_radius
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, amplify_and_forward, hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, fail, items, per_step, shown
+from heliograph.numerics.linalg import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.combine import GainAndNoise

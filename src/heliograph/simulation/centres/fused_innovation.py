@@ -1,0 +1,118 @@
+"""Innovation of a fused estimate: what arrives at the nodes, less what the predicted fused estimate expects of it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.gaussian.adaptive import AdaptiveBelief
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.linear.linear import LinearBelief
+from heliograph.filters.plausibility import innovation_distance
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import at
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.gathering import gathering
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.side_by_side import Alike
+
+UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
+WHOLE = Belief, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
+
+
+class FusedDistance(NamedTuple):
+    """Squared innovation e' S^-1 e of a fused estimate, NaN where nothing arrived, and how many numbers arrived."""
+
+    distance: jax.Array
+    arrived: jax.Array
+
+
+class FusedInnovation(Module):
+    """Test of a fused estimate xf of covariance Pf by the measurements of the nodes whose estimates it fuses.
+
+    From the last step's xf and Pf, e = z - H xf- with z the measurements of all nodes has the covariance
+    S = H Pf- H' + R, since what was fused depends on none of their noises. Node after node: the prediction is corrected
+    by the first node's filter, the result by the second's, and so on; with e_i the innovation of each and S_i its
+    covariance, e' S^-1 e = sum_i e_i' S_i^-1 e_i. So each node's filter says what its sensor and channel do. If Pf is
+    exact and all is Gaussian, e' S^-1 e is chi-squared; if Pf is an upper bound, so is S, and the mean is at most the
+    number of values.
+
+    Args:
+        start: the plant's initial law, before the first fusion.
+        sources: kind and filter of the estimates that are fused.
+    """
+
+    start: Belief
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+
+    def step(
+        self, before: Belief, alike: Sequence[Alike], states: Sequence[PyTree], z: Sequence[jax.Array], u: jax.Array,
+        k: jax.Array, skip: Sequence[jax.Array | None],
+    ) -> FusedDistance:  # fmt: skip
+        """Test the prediction from the fused estimate `before`, with the filters' states before step k.
+
+        `skip`: reasons not to use a node's measurement, by kind.
+        """
+        carry: tuple[jax.Array, ...] | None = None
+        for kind, f in self.sources:
+            # Numbers of each node's filter, its state and what it receives.
+            item, why = alike[kind], skip[kind]
+            mine = slice(f * item.nodes, (f + 1) * item.nodes)
+            filters, local = jax.tree.map(
+                lambda a, mine=mine: a[mine] if eqx.is_array(a) else a, (item.filters, states[kind])
+            )
+            received = z[item.group] if why is None else jnp.where(why[f][:, None] > 0, jnp.nan, z[item.group])
+            numbers, static = eqx.partition(filters, eqx.is_array)
+            # Prediction from the fused estimate, by the first node's model of the plant.
+            if carry is None:
+                head, state = jax.tree.map(lambda a: a[0], (numbers, local))
+                start = eqx.combine(head, static).predict(_with(state, *before), u, k)
+                carry = start.mean, start.covariance, jnp.zeros(()), jnp.zeros(())
+
+            def correct(carry: PyTree, row: PyTree, static: PyTree = static) -> tuple[PyTree, None]:
+                mean, covariance, distance, arrived = carry
+                numbers, prior, z_i = row
+                after, innovation = eqx.combine(numbers, static).correct(_with(prior, mean, covariance), z_i, k)
+                more, count = innovation_distance(innovation)
+                return (after.mean, after.covariance, distance + more, arrived + count), None
+
+            # What else a filter's state holds, predicted; then correction by node after node.
+            predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
+            rows = numbers, predict(filters, local), received
+            carry, _ = jax.lax.scan(correct, carry, rows, unroll=min(item.nodes, UNROLLED))
+        assert carry is not None  # there is at least one node
+        _, _, distance, arrived = carry
+        return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
+
+
+def _with(state: PyTree, mean: jax.Array, covariance: jax.Array) -> PyTree:
+    return state._replace(mean=mean, covariance=covariance)
+
+
+def following_prior(estimate: Estimate) -> Belief:
+    """Return the fused estimate as what the next step is predicted from."""
+    return Belief(jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
+
+
+def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, FusedInnovation]:
+    """Tests of the network's fusions of estimates, by name, where there is one.
+
+    There is none where a filter's state is more than a mean and a covariance, such as a mixture, or a fusion claims no
+    covariance, or where nodes share a channel, fading or relays: their measurements' noises then depend on each other.
+    """
+    results: dict[str, FusedInnovation] = {}
+    if network.common is not None or network.relays is not None or network.shared:
+        return results
+    places, plant = network.places(), at(network.plant, 0)
+    start = Belief(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
+    claims = network.claims()
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion) and claims[FUSED][name] != "none":
+            sources, _ = gathering(network, places, network.nodes_with(item.filter), item.filter)
+            if all(isinstance(eqx.filter_eval_shape(alike[kind].init), WHOLE) for kind, _ in sources):
+                results[name] = FusedInnovation(start, sources)
+    return results
