@@ -92,6 +92,7 @@ def learn(
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
+    # Rows of a table, or events, which are rows in the order of measuring.
     messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
     if messages is None and holds_events(measurements):
         messages = event_table(measurements, start)
@@ -101,9 +102,8 @@ def learn(
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
-    true = None if recording.truth is None else recording.truth[:cut]
     early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
-                      recording.time[:cut], true)  # fmt: skip
+                      recording.time[:cut], None if recording.truth is None else recording.truth[:cut])  # fmt: skip
 
     # Progress by iterations of the search.
     def say(line: str) -> None:

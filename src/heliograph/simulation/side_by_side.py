@@ -44,7 +44,7 @@ def filter_step(
     the state before it stays.
     """
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
-    # With a smoother step, a judgement, or neither.
+    # With a smoother step, and a judgement of the same step.
     judgement, weighed = None, None
     if smooths:
         if judges:
@@ -52,6 +52,7 @@ def filter_step(
             weighed = weighed_in(innovation)
         after, steps = filter.step_with_smoother(state, z, u, k)
         return after, StepOutput(filter.after_step(after, k), steps, judgement, weighed)
+    # With a judgement, or alone.
     if judges:
         after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
         weighed = weighed_in(innovation)
