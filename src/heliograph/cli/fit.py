@@ -78,6 +78,7 @@ def learn(
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.network_file import load_module
     from heliograph.files.recording import Recording, read_recording
+
     # Learning and its page are imported when the command runs.
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
