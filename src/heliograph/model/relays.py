@@ -191,14 +191,14 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     spread, talks = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
-            own_gain, own_offset, own_spread = link_moments(at(link, k))
+            link_gain, link_offset, link_spread = link_moments(at(link, k))
             # A listener receives the sum of its links: gains, offsets and spreads of independent links add.
-            received = starts[listener] + np.arange(len(own_offset))
+            received = starts[listener] + np.arange(len(link_offset))
             sent = m * senders.index(sender) + np.arange(m)
-            gain[np.ix_(received, sent)] = own_gain
-            offset[received] += own_offset
+            gain[np.ix_(received, sent)] = link_gain
+            offset[received] += link_offset
             with_one = np.append(sent, columns)
-            spread[np.ix_(received, received, with_one, with_one)] += own_spread
+            spread[np.ix_(received, received, with_one, with_one)] += link_spread
             live[received], talks[senders.index(sender)] = 1.0, 1.0
     return gain, offset, spread, live, talks
 

@@ -66,6 +66,7 @@ class Edges(Module):
                     age = 0 if late is None else z[-1].astype(int) if late.timestamped else late.times[0]
                     return state, jnp.where(arrives & (age <= count), age, -1)
 
+                # All channels of one kind at once; their flags go to the places of the edges.
                 both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
                 state, arrives = both(group, state, k * self.rounds + number)
                 following.append(state)
