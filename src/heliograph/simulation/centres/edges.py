@@ -144,9 +144,9 @@ def check_edge(link: Channel) -> None:
         late = late_part(item)
         if late is not None and not (late.constant or late.timestamped):
             raise fail("link between neighbours", "delays that the receiver knows (timestamped=True)", "others")
-        inside = _kept(item)
-        inside = inside if late is None else _kept(late.link)
-        for part in map(_kept, inside.maps if isinstance(inside, Modes) else [inside]):
+        inside = _without_losses(item)
+        inside = inside if late is None else _without_losses(late.link)
+        for part in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
             if part.remembers or part.past or not _is_perfect(part):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail("link between neighbours", expected, type(first(link)).__name__)
@@ -154,11 +154,11 @@ def check_edge(link: Channel) -> None:
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:
     """Return the delay of a link, whose messages may also be lost; None of one without."""
-    inside = _kept(channel)
+    inside = _without_losses(channel)
     return inside if isinstance(inside, Delayed) else None
 
 
-def _kept(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+def _without_losses(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the link for messages that are not lost."""
     while isinstance(channel, Erasure):
         channel = channel.base
