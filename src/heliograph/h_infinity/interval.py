@@ -96,6 +96,7 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
             return _dot(x[0], x[1], params["dimension_numbers"])
         case "iota":
             return exact(equation.primitive.bind(**params))
+        # what may be true in a part of the interval alone is not decided
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decided(_compare(name, *x), continuous)
         case "sign":

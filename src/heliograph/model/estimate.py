@@ -20,7 +20,8 @@ class Estimate(Module):
     claim: "exact" if `covariance` is E[(x - mean)(x - mean)'], "upper" if it dominates it, "nominal" if it is only what
     the filter's approximations say, "none" if no covariance is claimed: then `covariance` is NaN.
 
-    All is up to the rounding of the mean. `claim` is what the filter claims of a sound estimate; of many, `claims` says
+    All is up to rounding, on the safe side: that of the mean, and a hundred eps of what a variance was before the last
+    measurement. `claim` is what the filter claims of a sound estimate; of many, `claims` says
     where it holds.
 
     Shapes: mean (..., n), covariance (..., n, n).

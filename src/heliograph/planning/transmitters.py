@@ -79,6 +79,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
     """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
     match channel:
+        # A hop that transmits is visited; a wire is not.
         case AbstractHop():
             if not transmits(channel):
                 return channel, place
@@ -99,6 +100,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
             return channel, place
+        # What wraps a link: inside it.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
             inside = place
@@ -112,6 +114,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
+    # The same object where nothing has changed.
     if all(part is before for part, before in zip(visited, channel.maps, strict=True)):
         return channel, place
     return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), place

@@ -289,11 +289,13 @@ def _tune(
         used[:, :, -network.received[-1] :] = False
     where = np.nonzero(used)
     unit = _units(network, start)[where]
+    # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
+    # Augmented Lagrangian: descend, then raise the multipliers of slots above their limit.
     for _ in range(ROUNDS if power_limit is not None else 1):
 
         def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
@@ -305,6 +307,7 @@ def _tune(
         if _within_limits(power / (limit * (1 - MARGIN)) - 1, multipliers):
             break
         multipliers = np.maximum(0.0, multipliers + STIFFNESS * (power / (limit * (1 - MARGIN)) - 1))
+    # Gains in their units again.
     if np.any(power > limit * (1 + POWER_TOLERANCE)):
         raise fail("power limit", "one that some gains meet", f"an excess of {np.max(power / limit) - 1:.2g}")
     tuned: np.ndarray = start.copy()

@@ -218,6 +218,7 @@ class Service:
                 said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
                 entries.append(_refused(None, {}, "malformed", said))
                 continue
+            # Verdicts: used, known already, or refused with the reason.
             if plant is not None:
                 touched[plant.name] = plant
             if verdict == "used":

@@ -64,6 +64,7 @@ class Using:
                 outcomes[i] = self._outcome(i, messages[i])
             self.fleet.step(list({item.plant.name: item.plant for item in self._taken}.values()))
             result = self._judges.implausible(self._taken)
+            # Plants that an implausible message has spoilt go back.
             spoilt = set()
             for i, why in result.items():
                 number, plant, event, _ = self._taken[i]

@@ -144,6 +144,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
         )
         return both
 
+    # As many steps back as the lag has.
     _, outcome = jax.lax.fori_loop(0, lag, body, start)
     result: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
     return result

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -63,7 +63,8 @@ class GaussianFilter(AbstractBeliefFilter):
         plant, sensor, channel = at((self.plant, self.sensor, self.channel), step.k)
         u = jnp.asarray(step.u)
         output = observed_through(channel.mean_gain, sensor.matrix)
-        return linear_smoother_step(step, (plant.transition_matrix(u), plant.noise_covariance(u), output), self.claim)
+        model = plant.transition_matrix(u), plant.noise_covariance(u), output
+        return linear_smoother_step(step, model, state_rounding(initial_size(self)), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

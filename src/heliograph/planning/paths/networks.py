@@ -49,6 +49,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
         raise _unfit("nodes that share a channel (give a function of free numbers)")
+    # Second moments of the plant at each step, or in its steady state.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
@@ -123,6 +124,7 @@ def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefi
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:
             moved = moved or bool(np.any(np.asarray(part.noise.mean)))
+    # Fading multiplies the last hop.
     if hops:
         last = list(hops)[-1]
         hops[last] = (hops[last][0] * fading, hops[last][1])

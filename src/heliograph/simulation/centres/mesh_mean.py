@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.mesh.gains import Gains
+from heliograph.fusion.mesh.gains import Gains, transitions
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
@@ -25,7 +25,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.edges import arrival_chance
-from heliograph.simulation.centres.mesh import Mesh, Parts, Rows, transitions
+from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
 from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
 from heliograph.simulation.network import Network
 
@@ -67,6 +67,7 @@ def mean_mesh_errors(
     if not (item.rule.needs_joint or isinstance(item.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
         raise fail(f"mean errors of fusion {fusion!r}", expected, type(item.rule).__name__)
+    # Probability of each pattern of arrivals.
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
@@ -80,6 +81,7 @@ def mean_mesh_errors(
     rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
+    # Joint errors, step after step, averaged over the patterns.
     joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
     errors = []
     for k, u_k in enumerate(u):
@@ -116,7 +118,7 @@ def _mean(
 
     # Gains of every pattern, M_i with the node itself first.
     with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion))))
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion.matrix))))
     f, w = np.asarray(gains.innovation), np.where(patterns.present[:, :, None, None], gains.gain[:, None], 0.0)
     # Different receivers: products of means.
     result = congruence(spread(mesh, mean(m), mesh.edges.present), joint)

@@ -41,6 +41,7 @@ def _words(channel: AbstractRandomAffine) -> str:
             return f"{_words(channel.base) or DIRECT}, {_percent(1 - channel.arrival)} lost"
         case Mixture():
             return _mixture(channel)
+        # Links that deliver late, and those whose modes remember.
         case Delayed():
             late = "/".join(map(str, channel.times))
             stamped = ", timestamped" if channel.timestamped else ""
