@@ -32,13 +32,14 @@ def reports_by_name(
 
 
 def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
-    """Messages that arrived from each node's neighbours, 1 or NaN (..., rounds times neighbours), and no delays."""
+    """Messages that arrived from each node's neighbours, 1 (or their ages) or NaN (..., rounds times neighbours)."""
     neighbours = network.meshes[name].neighbours or {}
     result = {}
     for i, node in enumerate(network.mesh_nodes(name)):
         if count := len(neighbours[node]):
             flags = arrived[..., i, :, 1 : count + 1]
-            values = np.where(flags, 1.0, np.nan).reshape(*flags.shape[:-2], -1)
+            ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
+            values = ages.reshape(*flags.shape[:-2], -1)
             result[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return result
 
