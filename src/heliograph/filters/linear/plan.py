@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
@@ -144,10 +144,7 @@ def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> Plan
         covariances=known,
         start=start.mean,
         projection=projection,
-        claim=item.claim,
-        states=item.states,
-        inputs=item.inputs,
-        received=item.received,
+        **sized(item.claim, item, item.received),
     )
 
 
