@@ -19,8 +19,8 @@ import numpy as np
 from alone import show
 from timeline import readme_network
 
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.serving.message import read_message
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store

@@ -25,6 +25,7 @@ PRIVATE = re.compile(
 ARRAY = re.compile(r"\b(np\.ndarray|jax\.Array|ArrayLike|Array)\b")
 SHAPED = re.compile(r"(Float|Int|Bool|Shaped|Num|Real|Inexact)\[[^\[\]]*\]")
 LONG = 15  # lines of a function that needs a comment above its steps
+STEP = 14  # statements of a step
 SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 PATHS = sorted(SOURCE.rglob("*.py"))
@@ -96,19 +97,28 @@ def test_docstrings_of_studies_and_tests_have_no_private_word():
     assert not wrong, "\n".join(sorted(wrong))
 
 
+def longest_step(node: Function, lines: list[str]) -> int:
+    """Number of statements that follow each other without a comment, at most; 0 of a function that needs none."""
+    inside = node.body[bool(ast.get_docstring(node)) :]
+    if not inside or node.end_lineno - inside[0].lineno + 1 <= LONG:
+        return 0
+    docstrings = {n.body[0].lineno for n in ast.walk(node) if isinstance(n, Function) and ast.get_docstring(n)}
+    starts = sorted(n.lineno for n in ast.walk(node) if isinstance(n, ast.stmt) and n is not node)
+    above = node.body[0].end_lineno if inside[0] is not node.body[0] else node.lineno  # a comment may stand first
+    longest = count = 0
+    for start in (line for line in starts if line not in docstrings):
+        steps = any(re.search(r"^ *#|  # ", line) for line in lines[above:start])
+        count, above = 1 if steps else count + 1, max(above, start)
+        longest = max(longest, count)
+    return longest
+
+
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_a_long_function_has_a_comment_above_its_steps(path):
-    lines, wrong = path.read_text().splitlines(), []
-    for node in definitions(path):
-        body = [] if isinstance(node, ast.ClassDef) else node.body[bool(ast.get_docstring(node)) :]
-        if not body:
-            continue
-        above = node.body[0].end_lineno if body[0] is not node.body[0] else node.lineno  # a comment may stand first
-        inside = lines[above : node.end_lineno]
-        length = node.end_lineno - body[0].lineno + 1
-        if length > LONG and not any(line.lstrip().startswith("#") for line in inside):
-            wrong.append(node.name)
-    assert not wrong, wrong
+    """A step is at most STEP statements, so that no comment stands for half a page."""
+    lines = path.read_text().splitlines()
+    functions = [node for node in definitions(path) if not isinstance(node, ast.ClassDef)]
+    assert not [f"{node.name}: {count}" for node in functions if (count := longest_step(node, lines)) > STEP]
 
 
 def test_every_parameter_of_what_is_public_is_in_its_docstring():

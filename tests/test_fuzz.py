@@ -93,7 +93,7 @@ CALLS = [  # what is called, and arguments with which it works
     (linear.LinearSystem, {"steps": SYSTEM.steps, "mean": SYSTEM.mean, "covariance": SYSTEM.covariance,
                           "projection": SYSTEM.projection}),
     (linear.load_schedule, {"path": "nothing.npz"}),
-    (relays.own_error_design, {"network": RELAYS, "horizon": 2}),
+    (relays.local_error_design, {"network": RELAYS, "horizon": 2}),
     (relays.given_design, {"network": RELAYS, "gains": {}}),
     (relays.relay_schedules, {"network": RELAYS, "design": None}),
     (relays.receiver_behind_relays, {"network": RELAYS, "gains": {}}),

@@ -41,7 +41,7 @@ START = 5.0 * np.eye(4)
 DESIGN = Later(lambda: h_infinity.recursive_design(GROWTH, 5.0))
 SLOT = {"r": {"sensor": HOP}, "receiver": {"r": HOP}}
 PERIODIC = model.RelayNetwork(*SCALAR, ("r",), [SLOT])
-LOCAL = Later(lambda: relays.periodic_own_error_design(PERIODIC))
+LOCAL = Later(lambda: relays.periodic_local_error_design(PERIODIC))
 CLOCKS = {"motion": [[0.0, 1.0], [0.0, 0.0]], "dt": 0.5, "clocks": {"b": model.Clock(0.5, 2e-3)}}
 MOVING, SEEN = model.with_clocks(
     PLANT, {"a": SENSOR, "b": SENSOR}, **{k: CLOCKS[k] for k in ("clocks", "motion", "dt")}
@@ -69,7 +69,7 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.joint_modes, {"channel": BURST, "nodes": None, "order": 1}),
     (random_affine.recorded_noise, {"samples": NOISE, "order": 2}),
     (linear.critical_arrival, {"plant": PLANT, "sensor": SENSOR, "gain": None}),
-    (relays.periodic_own_error_design, {"network": PERIODIC}),
+    (relays.periodic_local_error_design, {"network": PERIODIC}),
     (relays.periodic_given_design, {"network": PERIODIC, "gains": LOCAL.part("gains")}),
     (relays.periodic_behind_relays, {"network": PERIODIC, "gains": LOCAL.part("gains")}),
     (h_infinity.growth_system, {"steps": 3, "disturbance": [[0.2], [0.1]], "feedthrough": [[0.3]], "target": EYE,

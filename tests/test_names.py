@@ -73,6 +73,6 @@ def test_files_are_named_by_what_a_newcomer_looks_for():
     questions = [(row, names) for row, names in zip(rows, files, strict=True) if len(row) == 3]
     answered = [(row[0], names[0]) for row, names in questions if row[2].strip() == "yes"]
     for question, name in answered:
-        asked_for = set().union(*(stems(word) for word in re.findall(r"[a-z]+", question.lower())))
-        assert set().union(*(stems(word) for word in re.findall(r"[a-z]+", Path(name).stem))) & asked_for, name
+        question_words = set().union(*(stems(word) for word in re.findall(r"[a-z]+", question.lower())))
+        assert set().union(*(stems(word) for word in re.findall(r"[a-z]+", Path(name).stem))) & question_words, name
     assert len(questions) == 16 and len(answered) >= 14

@@ -27,7 +27,7 @@ even = {"a": {"sensor": link(), "b": link(0.0)}, "receiver": {"b": link()}}
 relays = hg.model.RelayNetwork(plant, sensor, ["a", "b"], [odd, even])
 
 horizon = 25
-local = hg.relays.own_error_design(relays, horizon)
+local = hg.relays.local_error_design(relays, horizon)
 tuned = hg.relays.receiver_error_design(relays, horizon)
 
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained")

@@ -110,7 +110,7 @@ def _add(
 ) -> None:
     """Add what a node says, or give it as the caption to the table or figure before it."""
     if node.type == "bullet_list":
-        blocks.append(Points([_text(item.children[0]) for item in node.children]))
+        blocks.append(Points([_text(child.children[0]) for child in node.children]))
     elif node.type == "table":
         blocks.append(_table(node))
     elif node.type == "fence" and node.info == "keys":
@@ -138,7 +138,7 @@ def _key_figure(line: str) -> KeyFigure:
 
 
 def _table(node: SyntaxTreeNode) -> Table:
-    header, *rows = (row for part in node.children for row in part.children)
+    header, *rows = (row for child in node.children for row in child.children)
     cells = [[_text(cell) for cell in row.children] for row in rows]
     wordy = "left" in str(header.children[1].attrs.get("style", ""))
     colours = [COLOURED.fullmatch(row[0]) for row in cells]

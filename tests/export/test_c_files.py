@@ -74,7 +74,7 @@ def scheduled():
     plant = hg.LinearPlant(LINE.matrix, LINE.noise, LINE.initial_mean, LINE.initial_covariance)
     slots = [{"relay": {"sensor": FADING}}, {"receiver": {"relay": FADING}}]
     network = hg.model.RelayNetwork(plant, RANGE, ["relay"], slots)
-    design = hg.relays.own_error_design(network, 30)
+    design = hg.relays.local_error_design(network, 30)
     return hg.filters.ScheduledFilter(hg.relays.relay_schedules(network, design)["relay"])
 
 

@@ -14,13 +14,13 @@ FIRST, LOCAL = (
     (0.8, 0.1),
     ((0.9, 0.05), (0.7, 0.02)),
 )  # mean and variance of the gains of the shared hop and each node's
-HOP_NOISE, OWN_NOISE = 0.05, 0.1
+HOP_NOISE, LOCAL_NOISE = 0.05, 0.1
 
 
 def shared_network(fused):
     """One sensor of two outputs with correlated noise, one hop for both, then a hop to each node."""
     plant = hg.LinearPlant(A, Q, MEAN, np.eye(2))
-    hops = [hg.hop(two_gains(*gain), noise=OWN_NOISE) for gain in LOCAL]
+    hops = [hg.hop(two_gains(*gain), noise=LOCAL_NOISE) for gain in LOCAL]
     common = hg.hop(two_gains(*FIRST), noise=HOP_NOISE, dimension=2)
     channel = hg.amplify_and_forward([common, hg.parallel(hops)])
     filters = {}
@@ -37,7 +37,7 @@ def spread(second):
     received = (FIRST[0] ** 2 + FIRST[1]) * (second + R) + HOP_NOISE * np.eye(2)
     total = np.outer(gains, gains) * received + np.diag([variance for _, variance in LOCAL]) * received
     known = FIRST[0] * np.diag(gains)
-    return total + OWN_NOISE * np.eye(2) - known @ second @ known
+    return total + LOCAL_NOISE * np.eye(2) - known @ second @ known
 
 
 def by_hand(steps):

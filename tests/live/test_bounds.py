@@ -25,14 +25,14 @@ def network():
 
 
 def test_a_push_replays_its_row_and_those_after_it(network, monkeypatch):
-    timeline, spans = hg.Timeline(network, 100.0), []
-    replayed = timeline._replayed
-    monkeypatch.setattr(timeline, "_replayed", lambda row, *span: (spans.append(span), replayed(row, *span))[1])
-    for time in (1.0, 3.0, 5.0, 2.0, 4.5, 0.5):
+    timeline, stepped = hg.Timeline(network, 100.0), []
+    pool = timeline._fleet.pool
+    step = pool.step
+    monkeypatch.setattr(pool, "step", lambda *rows: (stepped.append(rows), step(*rows))[1])
+    pushes = (1.0, 1), (3.0, 2), (5.0, 3), (2.0, 6), (4.5, 8), (0.5, 14), (2.0, 14)  # the last one is a copy
+    for time, rows in pushes:
         timeline.push("a", 0, time, 1.0, 6.0)
-    assert [stop - start for start, stop in spans] == [1, 1, 1, 3, 2, 6]
-    timeline.push("a", 0, 2.0, 1.0, 7.0)  # a copy
-    assert len(spans) == 6
+        assert len(stepped) == rows
 
 
 def test_each_row_is_final_once_and_in_order_and_no_more_are_held_than_allowed(network):
@@ -45,7 +45,7 @@ def test_each_row_is_final_once_and_in_order_and_no_more_are_held_than_allowed(n
         if i % 5 == 4:
             final.append(small.final())
     assert small.push("a", 0, moments[-7], 0.0) == "late" and whole.push("a", 0, moments[-7], 0.0) == "used"
-    assert small.forced == 295 and whole.forced == 0 and len(small._rows.held) == 6
+    assert small.forced == 295 and whole.forced == 0 and len(small._plant.rows.held) == 6
     small.advance(2e6)
     final.append(small.final())
     assert len(small.final().time) == 0

@@ -8,7 +8,7 @@ from heliograph.model.plant import LinearPlant, Plant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.law import bernoulli
-from heliograph.relays.design import given_design, own_error_design, relay_schedules
+from heliograph.relays.design import given_design, local_error_design, relay_schedules
 from tests.relays.relay_problems import example, unusual
 
 PLANT = LinearPlant([[0.9]], [[1.0]], [0.0], [[1.0]])
@@ -77,7 +77,7 @@ def test_a_network_without_noise_has_the_limits_design_and_one_that_diverges_is_
     def designed(noise, growth=0.9, steps=3):
         sensor, plant = LinearSensor([[1.0]], [[noise]]), LinearPlant([[growth]], [[noise]], [1.0], [[1.0]])
         relays = [{"a": {"sensor": hop(1.0, noise)}, "receiver": {"a": LINK}}]
-        return own_error_design(network(relays, plant=plant, sensor=sensor), steps)
+        return local_error_design(network(relays, plant=plant, sensor=sensor), steps)
 
     exact, near = designed(0.0), designed(1e-10)
     for name in exact.covariance:
@@ -88,7 +88,7 @@ def test_a_network_without_noise_has_the_limits_design_and_one_that_diverges_is_
 
 def test_schedules_are_saved_and_read_back(tmp_path):
     net = unusual()
-    schedules = relay_schedules(net, own_error_design(net, 6))
+    schedules = relay_schedules(net, local_error_design(net, 6))
     for name, schedule in schedules.items():
         schedule.save(tmp_path / name)
         again = load_schedule(tmp_path / name)

@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from heliograph.numerics.caching import cached
+from heliograph.random_affine.moments.monomials import symmetric_power
 
 CALLS: list[float] = []
 
@@ -73,3 +75,15 @@ def test_it_is_called_as_the_function_is() -> None:
         refusing()
     with pytest.raises(ValueError, match="no"):
         refusing(item=item)
+
+
+@pytest.mark.parametrize("order", [(False, True), (True, False)])
+def test_what_one_precision_traced_is_not_what_another_sees(order):
+    """Tables of a computation in float64 after one in single precision, and the reverse, while the first is there."""
+    gain, programs = np.random.default_rng(0).uniform(0.5, 1.0, (3, 3)), []
+    for double in order:
+        with jax.enable_x64(double):
+            programs.append(jax.jit(partial(symmetric_power, degree=3)))
+            result = np.asarray(programs[-1](gain))
+        assert result.dtype == (np.float64 if double else np.float32)
+        np.testing.assert_allclose(result, symmetric_power(gain, 3), rtol=1e-14 if double else 1e-5)

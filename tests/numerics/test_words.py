@@ -154,7 +154,8 @@ def test_a_name_like_no_other_is_refused_without_an_offer():
         ("update", r"write filter.correct\(state, z\), or filter.step\(state, z, u\)"),
         ("filter", r"write filter.run\(z, u\)"),
         ("smooth", r"write hg.rts_smoother\(filter, z, u\)"),
-        ("estimat", "closest: filter.estimate"),
+        ("estimat", "closest: estimate"),
+        ("gain", r"write hg.steady_state\(plant, sensor\).gain"),
     ],
 )
 def test_an_attribute_that_a_filter_has_elsewhere_is_answered_with_the_call_to_write(name, words):
@@ -162,6 +163,24 @@ def test_an_attribute_that_a_filter_has_elsewhere_is_answered_with_the_call_to_w
     for item in (hg.kalman_filter(plant, sensor), hg.linear_filter(plant, sensor, hg.perfect())):
         with pytest.raises(AttributeError, match=f"{type(item).__name__} has no attribute '{name}'; {words}"):
             getattr(item, name)
+
+
+def test_any_object_of_ours_answers_a_wrong_attribute_with_near_ones_or_the_function_to_call():
+    plant, sensor = hg.LinearPlant(np.eye(2), 0.1, [0.0, 0.0], 1.0), hg.LinearSensor([[1.0, 0.0]], 0.1)
+    filtered = hg.extended_filter(plant, sensor).run(np.zeros((3, 1)))  # no link: all arrives as it is
+    node = hg.Node(sensor, hg.perfect(), {})
+    for item, name, words in (
+        (filtered, "mean", "closest: means"),
+        (filtered, "P", "closest: covariances"),
+        (filtered, "nis", "write hg.nis"),
+        (hg.Stream(hg.kalman_filter(plant, sensor)), "update", "closest: push"),
+        (hg.Network(plant, {"a": node}), "run", "write hg.run"),
+        (sensor, "R", "closest: noise"),
+    ):
+        with pytest.raises(AttributeError, match=f"^{type(item).__name__} has no attribute '{name}'; {words}"):
+            getattr(item, name)
+    with pytest.raises(AttributeError, match=r"closest: heliograph\.CovarianceIntersection"):
+        hg.fusion.CovarianceIntersection  # noqa: B018
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ def likelihood(model, z, u, form):
     (conditional).
     """
     a, b, q, c, r, v, m, offset, spread, x, p = model
-    own_x, own_p, total = x, p, 0.0
+    local_x, local_p, total = x, p, 0.0
     for z_k, u_k in zip(z, u, strict=True):
         x, p = a @ x + b @ u_k, a @ p @ a.T + q
-        own_x, own_p = a @ own_x + b @ u_k, a @ own_p @ a.T + q
-        of_x, of_p = (own_x, own_p) if form == "linear" else (x, p)
+        local_x, local_p = a @ local_x + b @ u_k, a @ local_p @ a.T + q
+        of_x, of_p = (local_x, local_p) if form == "linear" else (x, p)
         y = np.append(c @ of_x + v, 1.0)
         w = np.outer(y, y)
         w[:-1, :-1] += c @ of_p @ c.T + r

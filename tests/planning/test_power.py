@@ -106,7 +106,7 @@ def test_relays_that_filter_send_what_their_design_says():
         {"south": {"sensor": hop}, "receiver": {"north": hop}},
     ]
     relays = hg.model.RelayNetwork(PLANT, SENSOR, ["north", "south"], slots)
-    design = hg.relays.own_error_design(relays, 10)
+    design = hg.relays.local_error_design(relays, 10)
     schedules = hg.relays.relay_schedules(relays, design)
     receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
     result = hg.power(hg.Network.of_relays(relays, schedules, {"best": receiver}))

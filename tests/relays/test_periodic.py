@@ -9,11 +9,11 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.relays.descent import bfgs
-from heliograph.relays.design import given_design, own_error_design, receiver_behind_relays
+from heliograph.relays.design import given_design, local_error_design, receiver_behind_relays
 from heliograph.relays.periodic import (
     periodic_behind_relays,
     periodic_given_design,
-    periodic_own_error_design,
+    periodic_local_error_design,
     periodic_receiver_error_design,
     periodic_relays_for_best_receiver,
 )
@@ -24,7 +24,7 @@ PAPER = 1.066244e-5  # steady sum of even and odd tr P, by the oracle's 4000 ste
 
 @pytest.fixture(scope="module")
 def local():
-    return periodic_own_error_design(example())
+    return periodic_local_error_design(example())
 
 
 def traces(covariance):
@@ -34,7 +34,7 @@ def traces(covariance):
 def test_the_steady_state_is_where_the_recursion_settles(local):
     odd, even = local.trace("receiver")[1:]
     assert (even, odd) == pytest.approx((5.307279e-6, 5.355157e-6), rel=1e-6)  # digits given
-    long = own_error_design(example(), 1500)  # the plant forgets by 0.98 a step
+    long = local_error_design(example(), 1500)  # the plant forgets by 0.98 a step
     assert relative(local.moments[1:], long.moments[-2:]) < 1e-9
     given = periodic_given_design(example(), local.gains)
     assert relative(given.moments, local.moments) < 1e-9  # of a linear solve: condition about 1e3
@@ -60,7 +60,7 @@ def test_without_relays_it_is_the_linear_filter():
     full = example()
     direct = full.slots[1]["relay_1"]["sensor"]
     net = RelayNetwork(full.plant, full.sensor, (), ({"receiver": {"sensor": direct}},))
-    steady = periodic_own_error_design(net).covariance["receiver"][-1]
+    steady = periodic_local_error_design(net).covariance["receiver"][-1]
     filter_ = linear_filter(full.plant, full.sensor, direct)
     state = filter_.init()
     for k in range(800):
@@ -73,10 +73,10 @@ def test_what_has_no_steady_state_is_refused(local):
     net = example()
     unstable = LinearPlant(1.1 * np.eye(3), np.eye(3), np.zeros(3), np.eye(3))
     with pytest.raises(ValueError, match="spectral radius below 1"):
-        periodic_own_error_design(RelayNetwork(unstable, net.sensor, net.relays, net.slots))
+        periodic_local_error_design(RelayNetwork(unstable, net.sensor, net.relays, net.slots))
     varying = RelayNetwork(over_time([net.plant] * 4), net.sensor, net.relays, net.slots)
     with pytest.raises(ValueError, match="varies with its slots only"):
-        periodic_own_error_design(varying)
+        periodic_local_error_design(varying)
     loud = {name: 30 * gain for name, gain in local.gains.items()}
     with pytest.raises(ValueError, match="second moments that converge, got growth by"):
         periodic_given_design(net, loud)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from heliograph.filters.linear.scheduled import ScheduledFilter
-from heliograph.relays.design import own_error_design, receiver_behind_relays
+from heliograph.relays.design import local_error_design, receiver_behind_relays
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, network_of, relative, unusual
 
@@ -48,14 +48,14 @@ def best_from_all_measurements(p, gains):
 def test_it_is_the_best_linear_function_of_everything_received():
     p = oracle.random_problem(2, horizon=6)
     net = network_of(p)
-    gains = own_error_design(net, 6).gains
+    gains = local_error_design(net, 6).gains
     result = receiver_behind_relays(net, gains).gains.covariance
     assert relative(result, best_from_all_measurements(p, gains)) < 1e-9  # of the batch solve
 
 
 def test_it_is_at_least_as_good_as_the_greedy_receiver():
     for net, horizon in ((example(), 100), (unusual(), 9)):
-        design = own_error_design(net, horizon)
+        design = local_error_design(net, horizon)
         best = np.trace(receiver_behind_relays(net, design.gains).gains.covariance, axis1=1, axis2=2)
         assert np.all(best <= design.trace("receiver")[1:] * (1 + 1e-9))
         assert best[-1] < 0.999 * design.trace("receiver")[-1]
@@ -69,7 +69,7 @@ def test_bad_gains_are_refused():
 
 
 def test_it_runs_as_a_filter():
-    schedule = receiver_behind_relays(example(), own_error_design(example(), 3).gains)
+    schedule = receiver_behind_relays(example(), local_error_design(example(), 3).gains)
     filter_ = ScheduledFilter(schedule)
     _, estimate = filter_.step(filter_.init(), [0.5], (), 0)
     assert estimate.mean.shape == (3,) and estimate.claim == "exact"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.relays.design import given_design, own_error_design
+from heliograph.relays.design import given_design, local_error_design
 from heliograph.relays.receiver_error import receiver_error_design
 from heliograph_studies.successive_relays.raw_moments import recompute
 from tests.relays.relay_problems import example, relative, unusual
@@ -12,12 +12,12 @@ STEPS, SWEEPS = 6, 300  # of the network that is unusual
 
 @pytest.fixture(scope="module")
 def local():
-    return own_error_design(example(), HORIZON)
+    return local_error_design(example(), HORIZON)
 
 
 @pytest.fixture(scope="module")
 def greedy():
-    return own_error_design(unusual(), STEPS)
+    return local_error_design(unusual(), STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_tuned_together_the_receiver_errs_less(local):
 @pytest.mark.slow
 def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=40, result=0.8752):
     """Descents that stop after a count of steps differ by what rounding makes of it: 0.1 % of the error."""
-    separate = own_error_design(example(), horizon)
+    separate = local_error_design(example(), horizon)
     power, noise = separate.total_power(), np.random.default_rng(0).normal(size=horizon)
     for change in (0.0, 1e-12, 1e-7):
         limit = power * (1 + change * noise)
@@ -51,7 +51,7 @@ def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=
 
 
 def test_the_same_limit_gives_the_same_bits(horizon=40):
-    power = own_error_design(example(), horizon).total_power()
+    power = local_error_design(example(), horizon).total_power()
     first, second = (receiver_error_design(example(), horizon, power_limit=power, sweeps=20) for _ in range(2))
     for name, gains in first.gains.items():
         np.testing.assert_array_equal(gains, second.gains[name])

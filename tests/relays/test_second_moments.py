@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.model.relays import RelayNetwork
-from heliograph.relays.design import given_design, own_error_design
+from heliograph.relays.design import given_design, local_error_design
 from heliograph_studies.successive_relays.raw_moments import recompute
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, gains_of, network_of, relative, unusual
@@ -39,7 +39,7 @@ def compare(p, design, solution):
 def test_lemmas_and_gains_agree_with_the_oracle(name):
     p = PROBLEMS[name]()
     solution = oracle.solve(p)
-    design = own_error_design(network_of(p), len(p.Gam))
+    design = local_error_design(network_of(p), len(p.Gam))
     assert compare(p, design, solution) < TOLERANCE
     expected = gains_of(solution.K, solution.L)
     for filter_, gain in design.gains.items():
@@ -55,15 +55,15 @@ def test_any_gains_agree_with_the_oracle():
 
 
 def test_slots_in_turn_are_the_same_as_listed_slots():
-    listed = own_error_design(network_of(oracle.section_iv(20)), 20)
-    assert relative(own_error_design(example(), 20).moments, listed.moments) < TOLERANCE
+    listed = local_error_design(network_of(oracle.section_iv(20)), 20)
+    assert relative(local_error_design(example(), 20).moments, listed.moments) < TOLERANCE
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.2])
 def test_a_network_of_another_kind_agrees_with_raw_moments(scale):
     """Three relays, full duplex, self-interference, direct and dependent links, noise means; greedy or other gains."""
     net, rng = unusual(), np.random.default_rng(1)
-    design = own_error_design(net, 9)
+    design = local_error_design(net, 9)
     gains = {name: gain + scale * rng.normal(size=gain.shape) for name, gain in design.gains.items()}
     design, result = given_design(net, gains), recompute(net, gains)
     for name in net.filters:
@@ -103,7 +103,7 @@ def zero(columns):
 
 
 def design_of(p):
-    return own_error_design(network_of(p), len(p.Gam))
+    return local_error_design(network_of(p), len(p.Gam))
 
 
 def open_loop(p):
@@ -162,7 +162,7 @@ def test_exchanging_relays_and_parity():
         {names[listener]: {names[s]: link for s, link in links.items()} for listener, links in slot.items()}
         for slot in net.slots
     ]
-    exchanged = own_error_design(RelayNetwork(net.plant, net.sensor, net.relays, slots), len(p.Gam))
+    exchanged = local_error_design(RelayNetwork(net.plant, net.sensor, net.relays, slots), len(p.Gam))
     for name in net.filters:
         assert relative(exchanged.covariance[names[name]], design.covariance[name]) < TOLERANCE
 
@@ -190,7 +190,7 @@ def test_a_receiver_that_copies_its_relay():
     mean[:, 3:], var[:, 3:] = 1.0, 0.0
     p = p._replace(Psi=np.tile(np.eye(2), (11, 1, 1)), mean=mean, var=var)
     net = network_of(p)
-    gains = own_error_design(net, 10).gains | {"receiver": p.Gam}
+    gains = local_error_design(net, 10).gains | {"receiver": p.Gam}
     design = given_design(net, gains)
     for k in range(1, 11):
         j = oracle.turns(k)[1]

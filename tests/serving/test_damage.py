@@ -11,7 +11,7 @@ import pytest
 from heliograph.numerics.check import InputError
 from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
-from heliograph.serving.storage.plant_codec import Carrier
+from heliograph.serving.storage.carrier import Carrier
 from heliograph.serving.storage.store import LAYOUT, Store
 from heliograph.serving.storage.store_protocol import Damage, identity
 from tests.serving.worlds import fleet, lines, messages, stepping

@@ -74,8 +74,8 @@ def test_limits_hold_here_too_and_it_is_said_once():
     item = hg.linear_filter(plant, SENSOR, HOP)
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
     said = []
-    from heliograph.serving.fleet import Fleet, Options
-    from heliograph.serving.lanes import Lanes
+    from heliograph.live.fleet import Fleet, Options
+    from heliograph.live.lanes import Lanes
 
     service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore(), said.append)
     sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
@@ -96,8 +96,8 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     )
     filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
-    from heliograph.serving.fleet import Fleet, Options
-    from heliograph.serving.lanes import Lanes
+    from heliograph.live.fleet import Fleet, Options
+    from heliograph.live.lanes import Lanes
 
     service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
     (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))

@@ -6,8 +6,8 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 import heliograph as hg
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.serving.output import Estimates
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
+from heliograph.live.plant import Link
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.page import Tallies
-from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.serving.watch import watch_of

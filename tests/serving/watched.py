@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic_core import to_json
 
+from heliograph.live.plant import Link
 from heliograph.serving.output import Output
-from heliograph.serving.plant import Link
 
 
 @dataclass

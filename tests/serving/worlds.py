@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
 HOP = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)

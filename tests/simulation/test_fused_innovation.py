@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving.lanes import Lanes
+from heliograph.live.lanes import Lanes
 
 F, Q = np.array([[1.0, 1.0], [0.0, 0.9]]), np.diag([0.01, 0.1])
 ROWS, NOISES = ([1.0, 0.0], [0.5, 1.0]), (0.5, 2.0)
@@ -27,7 +27,7 @@ def test_it_is_that_of_all_that_arrives_by_the_prediction_from_the_fused_estimat
     link = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), NOISE)
     rules = {"bound": hg.fusion.EqualIntersection(), "weights": hg.fusion.MatrixWeights()}
     lanes = Lanes(network(link, rules))
-    step, places = lanes.player.step_rows, {p.filter: p for p in lanes.places if p.node == "fused"}
+    step, places = lanes.step_rows, {p.filter: p for p in lanes.places if p.node == "fused"}
     z = np.random.default_rng(0).normal(0.0, 2.0, (8, 2))
     z[3, 0], z[5] = np.nan, np.nan
     state, h, r = step.start, np.array(ROWS), np.diag(NOISES)

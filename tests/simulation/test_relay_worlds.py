@@ -8,7 +8,7 @@ from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.relays.design import own_error_design, receiver_behind_relays, relay_schedules
+from heliograph.relays.design import local_error_design, receiver_behind_relays, relay_schedules
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
@@ -41,7 +41,7 @@ RUNS, CHUNK = 3072, LANES * BLOCK  # one block for each lane at a time: any numb
 
 @pytest.fixture(scope="module")
 def designed():
-    return own_error_design(example(), 20)
+    return local_error_design(example(), 20)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def worst(record, node, name):
 @pytest.mark.parametrize("kind", ["greedy", "another kind"])
 def test_designed_and_simulated_errors_agree_at_every_step(kind, request):
     if kind == "another kind":
-        network = relays(unusual(), own_error_design(unusual(), 7))
+        network = relays(unusual(), local_error_design(unusual(), 7))
         record = monte_carlo(network, 7, RUNS, 1, chunk=CHUNK)
     else:
         record = request.getfixturevalue("recorded")
@@ -127,7 +127,7 @@ def quiet():
 
 @pytest.fixture(scope="module")
 def quietly():
-    return own_error_design(quiet(), 12)
+    return local_error_design(quiet(), 12)
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,7 @@ def test_a_quadratic_smoother_is_the_best_in_z_and_its_squares():
 @pytest.mark.slow
 def test_a_receiver_behind_relays_smooths_the_relays_states_too():
     network, time = relays(), 6
-    gains = hg.relays.own_error_design(network, time).gains
+    gains = hg.relays.local_error_design(network, time).gains
     system = hg.relays.receiver_system(network, gains)
     receiver = hg.filters.LinearSystemFilter(system)
     s, projection = system.steps, system.projection

@@ -108,3 +108,20 @@ def test_a_state_that_later_data_tell_exactly_is_smoothed_to_its_rounding(smooth
         seen = ~np.isnan(record.measurements["a"][:, 1]).any(axis=-1)  # at the second step
         if not isinstance(smoothing, hg.smoothing.FixedPoint):
             assert variance[seen, 0].max() < 1e-16  # rounding of P, where the first was unseen
+
+
+@pytest.mark.parametrize("smoothing", [hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(3)])
+def test_a_state_without_noise_is_smoothed_to_some_roundings(smoothing):
+    """A plant and an output free of noise: from the first data on, the state is known.
+
+    A gain A^-1, which is right without rounding, took that of a later state for news, 1e10 times in the mean square.
+    """
+    direction = np.array([0.1, 0.5, -1.0])
+    matrix = [[0.6, 0.2, -0.9], [0.2, -0.1, -0.7], [-0.1, -0.3, -1.0]]
+    plant = hg.LinearPlant(matrix, 0.0, [2000.0, -150.0, 1500.0], np.outer(direction, direction))
+    sensor = hg.LinearSensor([[-0.1, -0.2, -1.3]], 0.0)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})})
+    record = hg.monte_carlo(network, 12, 20, 0, smooth=smoothing)
+    squared = np.mean(record.smoothed.errors("a", "f") ** 2, axis=0)
+    assert (squared <= (100 * np.finfo(float).eps * np.abs(record.truth).max(axis=(0, 1))) ** 2).all()
+    assert (squared <= 10 * np.einsum("...ii->...i", record.smoothed.estimates["a"]["f"].covariance[0])).all()

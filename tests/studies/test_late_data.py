@@ -63,7 +63,7 @@ def test_losses_are_gaps_within_a_boot_sorted_by_the_time_of_sending(tmp_path):
     assert (result.packets, result.nodes, result.boots) == (7, 2, 3)
     assert result.lost == 3 / 10 and result.run_max == 2 and result.run_mean == 1.5
     assert result.lost_after_lost == 1 / 3  # of the three lost ones one is followed by another
-    assert result.out_of_order == 2 / 6 and result.out_of_order_own == 1 / 5 and result.copies == 0
+    assert result.out_of_order == 2 / 6 and result.out_of_order_by_node == 1 / 5 and result.copies == 0
     fates = [np.isnan(fate).tolist() for fate in packets.fates()]
     assert fates == [[False, False, True, False, False], [False, True, True, False], [False]]
     assert [len(part) for part in fates_by_node(packets)] == [9, 1]

@@ -72,7 +72,7 @@ def _only(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tu
     return [(setting, number) for number in (chunks if chunk is None else [chunk])]
 
 
-def _done(result: CampaignRun) -> str:
-    if not result.computed and not result.failures:
-        return f"{result.folder}: nothing to compute, all {result.already} chunks are already there"
-    return f"{result.folder}: {result.computed} chunks computed, {result.already} were already there"
+def _done(run: CampaignRun) -> str:
+    if not run.computed and not run.failures:
+        return f"{run.folder}: nothing to compute, all {run.already} chunks are already there"
+    return f"{run.folder}: {run.computed} chunks computed, {run.already} were already there"

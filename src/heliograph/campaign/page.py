@@ -71,8 +71,8 @@ def _failed(failures: Sequence[Failure]) -> str:
 
 def _failures(failures: Sequence[Failure]) -> Section:
     points = [
-        f"setting {item.setting} {item.parameters}, runs {item.runs[0]} to {item.runs[1]}: {item.error}"
-        for item in failures[:REPORTED]
+        f"setting {failure.setting} {failure.parameters}, runs {failure.runs[0]} to {failure.runs[1]}: {failure.error}"
+        for failure in failures[:REPORTED]
     ]
     text = f"Tried three times. All of them, with tracebacks, are in {FAILURES}; run one again alone by its command:"
     return Section("What failed", [Points(points), Text([text]), Code(failures[0].command)])

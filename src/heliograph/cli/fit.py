@@ -85,6 +85,7 @@ def learn(
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)
+    # The network as it starts, and the data.
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
@@ -105,6 +106,7 @@ def learn(
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
+    # The fit.
     fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
     assert isinstance(fitted, Fit)  # since no sender decides
     # Predictions before and after the fit, then statistics of the losses.

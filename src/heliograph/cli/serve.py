@@ -32,6 +32,10 @@ def serve(
     ] = False,
     broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, or opc.tcp://host:port.")] = None,
     parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
+    node: Annotated[
+        str | None,
+        Parameter(help="Node of a fusion between neighbours that this process is; its messages go by the broker."),
+    ] = None,
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
 ) -> None:
@@ -50,12 +54,12 @@ def serve(
     import json
 
     from heliograph.files.network_file import load_module
+    from heliograph.live.fleet import Options
     from heliograph.numerics.check import fail
     from heliograph.serving.brokers.url import address
-    from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import ServiceSettings, name_of, run, store_of
+    from heliograph.serving.running import ServiceSettings, name_of, of_node, run, store_of
 
     # The schema needs no network.
     if schema:
@@ -66,7 +70,7 @@ def serve(
     # Settings of the service; it then runs until its messages end.
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    opened = store_of(network, store, parts)
+    opened = store_of(network, store, parts, node)
     loaded, module = load_module(network)
     settings = ServiceSettings(
         loaded,
@@ -82,4 +86,4 @@ def serve(
         name_of(network),
         accept_changes,
     )
-    asyncio.run(run(settings))
+    asyncio.run(run(settings if node is None else of_node(settings, node)))

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.codegen.compiled import Machine, aligned, best_width, features, pointers_to
+from heliograph.codegen.compiled import Machine, addresses, aligned, best_width, features
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import written
 from heliograph.codegen.program import Program, Summed, row_length
@@ -85,4 +85,5 @@ class Begun:
     def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
         place = self.program.summed.number
         inputs = [*self.arguments[:place], numbers, *self.arguments[place:]]
-        return pointers_to([*inputs, *self.program.code.tables, *results, self.memory])
+        every = [*inputs, *self.program.code.tables, *results, self.memory]
+        return np.array(addresses(every), dtype=np.uint64)

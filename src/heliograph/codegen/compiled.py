@@ -75,27 +75,39 @@ class Compiled:
         self.code: Code = written(program, self.differs, self.width, features()[2])
         self.blocks = Machine(self.code.blocks)
         self.once = None if self.code.once is None else Machine(self.code.once)
+        self._first: list[np.ndarray] = []
+        self._addresses, self._tables = list[int](), addresses(self.code.tables)
+
+    def with_first(self, *leaves: Any) -> "Compiled":
+        """Return the same code whose first arguments are these, which calls leave out."""
+        new = copy(self)
+        new._first = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=False)]
+        new._addresses = addresses(new._first)
+        return new
 
     def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
         """Return the results of all runs, with a leading axis of runs."""
-        arrays = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=True)]
+        arrays, given = list(self._first), len(self._first)
+        arrays += [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types[given:], strict=True)]
         runs = next((len(x) for x, d in zip(arrays, self.differs, strict=True) if d), 1)
         code = self.code
         outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
         shared = aligned(code.shared)
-        pointers = pointers_to([*arrays, *code.tables, *outputs, shared])
+        ends = addresses([*outputs, shared])
+        pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
         if self.once is not None:
             self.once.run(pointers.ctypes.data, 0, 0, 1, 1)
             self._copy_common(outputs, shared)
         if not all(code.common):
-            self._run(pointers, runs, cores or cpu_count())
+            self._run(pointers, runs, cores)
         return jax.tree.unflatten(self.tree, outputs)
 
-    def _run(self, pointers: np.ndarray, runs: int, cores: int) -> None:
+    def _run(self, pointers: np.ndarray, runs: int, cores: int | None) -> None:
         blocks = -(-runs // self.width)
         if cores == 1 or blocks * self.code.work < LITTLE:
             self._blocks(pointers, 0, blocks, runs)
             return
+        cores = cores or cpu_count()
         share = -(-blocks // (cores * SHARES))
         starts = range(0, blocks, share)
         list(threads().map(lambda start: self._blocks(pointers, start, min(start + share, blocks), runs), starts))
@@ -140,7 +152,8 @@ class Alone:
         fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
         self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(fresh)]
         self.scratch, self._shared = aligned(self.code.scratch), aligned(self.code.shared)
-        self.pointers = pointers_to([*self.inputs, *self.code.tables, *self.outputs, self._shared])
+        every = [*self.inputs, *self.code.tables, *self.outputs, self._shared]
+        self.pointers = np.array(addresses(every), dtype=np.uint64)
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:
@@ -160,9 +173,9 @@ def best_width() -> int:
     return 8
 
 
-def pointers_to(arrays: Sequence[np.ndarray]) -> np.ndarray:
+def addresses(arrays: Sequence[np.ndarray]) -> list[int]:
     """Return the addresses of arrays."""
-    return np.array([x.__array_interface__["data"][0] for x in arrays], dtype=np.uint64)
+    return [x.__array_interface__["data"][0] for x in arrays]
 
 
 def aligned(size: int) -> np.ndarray:

@@ -89,6 +89,7 @@ class InMemory:
             if n == 1:
                 strides.append(0)
                 continue
+            # The next old axis, with those that go on from it.
             if left == 1:
                 if place < 0:
                     return None

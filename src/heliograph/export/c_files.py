@@ -95,7 +95,7 @@ def text_of(item: AbstractFilter, prefix: str, real: Real, received: Sequence[st
     return c_text(step_program(item), Form(prefix, real, names, kind))
 
 
-def received_names(item: AbstractFilter) -> Sequence[str]:
+def received_names(filter: AbstractFilter) -> Sequence[str]:
     """Return the sensor's outputs if the filter has a sensor and as many arrive, else z0, z1, ..."""
-    outputs: tuple[str, ...] = first(item.sensor).outputs if hasattr(item, "sensor") else ()
-    return outputs if len(outputs) == item.received else [f"z{i}" for i in range(item.received)]
+    outputs: tuple[str, ...] = first(filter.sensor).outputs if hasattr(filter, "sensor") else ()
+    return outputs if len(outputs) == filter.received else [f"z{i}" for i in range(filter.received)]

@@ -117,7 +117,7 @@ class StepProgram(NamedTuple):
     equations: list[Any]
 
 
-def step_program(item: AbstractFilter) -> StepProgram:
+def step_program(filter: AbstractFilter) -> StepProgram:
     """Lower `step` of a filter to a graph of scalar operations.
 
     An array of the state that is symmetric at the start, and after every step from a symmetric one, is always
@@ -126,12 +126,12 @@ def step_program(item: AbstractFilter) -> StepProgram:
     Raises:
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
-    state = item.init()
+    state = filter.init()
     leaves, tree = jax.tree.flatten(state)
-    z, u, k = np.zeros(item.received), np.zeros(len(item.inputs)), np.asarray(0)
+    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
 
     def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> PyTree:
-        after, estimate = item.step(jax.tree.unflatten(tree, leaves), z, u, k)
+        after, estimate = filter.step(jax.tree.unflatten(tree, leaves), z, u, k)
         return jax.tree.leaves(after), estimate.mean, estimate.covariance
 
     # Trace the step, and refuse random numbers: a device has none.
@@ -141,7 +141,7 @@ def step_program(item: AbstractFilter) -> StepProgram:
         if equation.primitive.name.startswith(RANDOM):
             raise no_c(equation.primitive.name, place(equation))
     # Symmetry by induction: assume it for all arrays, drop those that a step does not keep symmetric, repeat.
-    estimate, names = item.estimate(state), names_of(state)
+    estimate, names = filter.estimate(state), names_of(state)
     symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
     while True:
         graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
@@ -154,7 +154,7 @@ def step_program(item: AbstractFilter) -> StepProgram:
     *after, mean, covariance = map(scalars, outputs)
     parts = zip(names, buffers, map(np.asarray, leaves), after, strict=True)
     return StepProgram(
-        filter=item,
+        filter=filter,
         graph=graph,
         leaves=[Leaf(*part) for part in parts],
         z=of_z,
@@ -224,7 +224,7 @@ def _equations(jaxpr: Any) -> Iterator[Any]:
     """Yield all operations, also those of inner programs."""
     for equation in jaxpr.eqns:
         yield equation
-        for part in equation.params.values():
-            for inner in part if isinstance(part, tuple | list) else (part,):
+        for param in equation.params.values():
+            for inner in param if isinstance(param, tuple | list) else (param,):
                 if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
                     yield from _equations(getattr(inner, "jaxpr", inner))

@@ -162,9 +162,9 @@ def _finish(members: Sequence[Member], program: StepProgram, source: CSource, co
     return [*lines, "    state->step += 1;"] if counts else lines
 
 
-def claim_of(item: AbstractFilter, real: Real) -> Claim:
+def claim_of(filter: AbstractFilter, real: Real) -> Claim:
     """Return the filter's claim; single precision proves nothing, since its rounding is not bounded."""
-    return item.claim if real == "double" or item.claim == "none" else "nominal"
+    return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
 def _comment(program: StepProgram, form: Form) -> str:

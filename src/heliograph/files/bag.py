@@ -165,7 +165,7 @@ def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
 
 
 def _add(
-    path: Path, reader: "AnyReader", sources: Sources, batch: list[RawMessage], done: int, result: EventTable
+    path: Path, reader: "AnyReader", sources: Sources, batch: list[RawMessage], done: int, table: EventTable
 ) -> None:
     """Append the events of messages one after another, up to the first that cannot be read, which is an error."""
     for number, (connection, logged, data) in enumerate(batch, done + 1):
@@ -180,7 +180,7 @@ def _add(
         except InputError as error:
             raise InputError(f"{path}, message {number}, logged at {moment(logged)}, {error}") from None
         for reading in readings:
-            result.add(reading, logged)
+            table.add(reading, logged)
 
 
 def fields_of(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:

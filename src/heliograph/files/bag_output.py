@@ -191,7 +191,7 @@ def _odometry(
     """Return an odometry message; `covariance` is None where none is claimed."""
     geometry = "geometry_msgs/msg/"
     vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
-    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, part) for part in places)
+    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, place) for place in places)
     rotation = types[f"{geometry}Quaternion"](*_quaternion(*position[3:]))
     there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
     moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))

@@ -64,6 +64,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
             numbers = [name for name, kind in fields if kind not in NO_NUMBERS and not name.startswith("header.")]
             stamped = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
             topics.setdefault(connection.topic, Topic(connection.msgtype, numbers, STAMP if stamped else None))
+        # When each message was logged, and how late by its stamp.
         total, done = reader.message_count, 0
         try:
             for done, (connection, logged, data) in enumerate(reader.messages(), 1):

@@ -19,7 +19,7 @@ from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.names import offered
+from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
@@ -36,6 +36,7 @@ INSTEAD = {  # what other packages call what a filter does here
     "update": "filter.correct(state, z), or filter.step(state, z, u), which predicts too",
     "filter": "filter.run(z, u) for rows of measurements",
     "smooth": "hg.rts_smoother(filter, z, u)",
+    "gain": "hg.steady_state(plant, sensor).gain",
 }
 
 
@@ -66,12 +67,7 @@ class AbstractFilter(Module):
 
         def __getattr__(self, name: str) -> NoReturn:
             """Refuse an attribute that does not exist with what to write instead, or the names most like it."""
-            kind = type(self)
-            if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
-                object.__getattribute__(self, name)
-            public = {item: f"filter.{item}" for item in dir(kind) if not item.startswith("_")}
-            remedy = f"; write {INSTEAD[name]}" if name in INSTEAD else offered(name, public)
-            raise AttributeError(f"{kind.__name__} has no attribute {name!r}{remedy}")
+            refuse_attribute(self, name, INSTEAD)
 
     def init(self) -> PyTree:
         """Return the state of the filter before the first step."""
@@ -217,31 +213,31 @@ def sized(claim: Claim, like: HasStates, received: int) -> Sizes:
 
 
 @compiled
-def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
-    after, _ = item.correct(item.predict(state, u, k), z, k)
-    return after, item.after_step(after, k)
+def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
+    after, _ = filter.correct(filter.predict(state, u, k), z, k)
+    return after, filter.after_step(after, k)
 
 
 @compiled
 def step_with_judgement(
-    item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
+    filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Judgement, Innovation]:
     """Step a filter, and return the estimate, the judgement of the measurement, and its innovation."""
-    prior = item.predict(state, u, k)
-    after, innovation = item.correct(prior, z, k)
-    estimate = item.after_step(after, k)
-    known = item.estimate(state), item.estimate(prior), estimate
-    judgement = judge(item.claim, (state, prior, after), known, innovation, z, item.of_atoms)
+    prior = filter.predict(state, u, k)
+    after, innovation = filter.correct(prior, z, k)
+    estimate = filter.after_step(after, k)
+    known = filter.estimate(state), filter.estimate(prior), estimate
+    judgement = judge(filter.claim, (state, prior, after), known, innovation, z, filter.of_atoms)
     return after, estimate, judgement, innovation
 
 
 @compiled
 def _step_with_smoother(
-    item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
+    filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, AbstractSmootherStep]:
-    prior = item.predict(state, u, k)
-    after, innovation = item.correct(prior, z, k)
-    return after, with_nis(item.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
+    prior = filter.predict(state, u, k)
+    after, innovation = filter.correct(prior, z, k)
+    return after, with_nis(filter.smoother_step(StepTrace(state, prior, after, innovation, z, u, k)), innovation)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
@@ -260,32 +256,32 @@ def _checked(
     run = cast(Callable[..., R], compiled(function))
 
     @wraps(function)
-    def call(item: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        return run(item, state, check(item, data), step_number(item, k))
+    def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
+        return run(filter, state, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)
 
 
-def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
+def measured(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     """Return z as a measurement of the filter's length, NaN where a component did not arrive.
 
     Empty for a filter that uses no measurements.
     """
-    result = _numbers("measurement", z, item.received or None)
+    result = _numbers("measurement", z, filter.received or None)
     if isinstance(result, np.ndarray) and np.isinf(result).any():
         raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(result).tolist())
-    return result if item.received else result[:0]
+    return result if filter.received else result[:0]
 
 
-def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
+def given(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     """Return u as an input of the filter's length."""
-    result = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
+    result = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
     if isinstance(result, np.ndarray) and not np.isfinite(result).all():
         raise fail("inputs", "finite numbers", np.asarray(result).tolist())
     return result
 
 
-def step_number(item: AbstractFilter, k: Step) -> Step:
+def step_number(filter: AbstractFilter, k: Step) -> Step:
     """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k
@@ -298,8 +294,8 @@ def step_number(item: AbstractFilter, k: Step) -> Step:
     values = np.asarray(k)
     if values < 0:
         raise fail("step", "a whole number from 0", k)
-    if item.horizon is not None and values >= item.horizon:
-        raise fail("step", f"one of the {item.horizon} that the filter covers, counted from 0", k)
+    if filter.horizon is not None and values >= filter.horizon:
+        raise fail("step", f"one of the {filter.horizon} that the filter covers, counted from 0", k)
     return values
 
 

@@ -118,7 +118,7 @@ def split(channel: AbstractRandomAffine) -> SplitChannel:
             )
         case Stack():
             # Parallel links are split one by one; one without outliers has no noise to take.
-            parts = [split(part) for part in channel.maps]
+            parts = [split(affine) for affine in channel.maps]
             if not any(part.noise for part in parts):
                 return SplitChannel(channel, None)
             noises = [part.noise or Gaussian(np.zeros((part.plain.outputs,) * 2)) for part in parts]

@@ -50,7 +50,7 @@ class Filtered:
 
 
 def over_rows(
-    item: "AbstractFilter",
+    filter: "AbstractFilter",
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
     result: Callable[[PyTree, Innovation, jax.Array], PyTree],
@@ -59,43 +59,43 @@ def over_rows(
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
-        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
         return after, result(after, innovation, k)
 
-    start = jax.tree.map(jnp.asarray, item.init())
+    start = jax.tree.map(jnp.asarray, filter.init())
     return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
 
 
-def filtered(item: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Filtered:
+def filtered(filter: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
-    mean, covariance, innovation = computed(_results, _by_xla, (item, *data_of(item, z, u)))
+    mean, covariance, innovation = computed(_results, _by_xla, (filter, *data_of(filter, z, u)))
     return Filtered(
-        mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, item.claim,
+        mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
         innovation.weight,
     )  # fmt: skip
 
 
-def _results(item: "AbstractFilter", z: Array, u: Array) -> PyTree:
+def _results(filter: "AbstractFilter", z: Array, u: Array) -> PyTree:
     def single(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
-        estimate = item.after_step(state, k)
+        estimate = filter.after_step(state, k)
         return estimate.mean, estimate.covariance, innovation
 
-    return over_rows(item, z, u, single)
+    return over_rows(filter, z, u, single)
 
 
 _by_xla = quickly_compiled(_results)
 
 
 def data_of(
-    item: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
+    filter: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
     """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed."""
-    z = rows("measurements", measurements, None, item.received or None, missing=True)
-    z = z if item.received else z[:, :0]
-    given = np.zeros((len(z), 0)) if inputs is None and not item.inputs else inputs
-    u = rows("inputs", given, len(z), len(item.inputs), missing=False)
-    if item.horizon is not None and len(z) > item.horizon:
-        raise fail("measurements", f"at most {item.horizon} steps, which the filter covers", len(z))
+    z = rows("measurements", measurements, None, filter.received or None, missing=True)
+    z = z if filter.received else z[:, :0]
+    given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
+    u = rows("inputs", given, len(z), len(filter.inputs), missing=False)
+    if filter.horizon is not None and len(z) > filter.horizon:
+        raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))
     return z, u
 
 

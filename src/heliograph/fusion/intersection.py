@@ -170,6 +170,7 @@ def intersect_inversely(
         common = inverses((w * p + (1 - w) * q)[None])[0]
         return p_information + q_information - common, common
 
+    # Golden section for the least trace.
     def cost(w: jax.Array) -> jax.Array:
         return jnp.trace(inverse(fused_information(w)[0]))
 
@@ -182,6 +183,7 @@ def intersect_inversely(
         return jnp.where(better, low, left), jnp.where(better, right, high)
 
     low, high = jax.lax.fori_loop(0, SEARCH_STEPS, shrink, (jnp.asarray(0.0), jnp.asarray(1.0)))
+    # Covariance and mean at the best weight.
     w = (low + high) / 2
     information, common = fused_information(w)
     covariance = inverse(information)

@@ -314,7 +314,7 @@ class EscapeQuantizer(AbstractQuantizer):
     @in_float64
     def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
         """Decode at the receiver: next state and value, from the present state and the symbols alone."""
-        escapes, segment, number, restart = (jnp.asarray(part) for part in symbols)
+        escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
         restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
         # A missed number means a wrong amplitude, until a restart.
         synchronised = restart | (state.number == number)

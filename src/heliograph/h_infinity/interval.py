@@ -17,7 +17,7 @@ Contraction = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Se
 ULPS = 4  # units in the last place: a library's sine or exponential is off by less than one, the arithmetic by a half
 MOVES = (
     "reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
-    "dynamic_slice", "gather", "pad", "split", "stack", "stop_gradient",
+    "dynamic_slice", "gather", "pad", "split", "stack", "unstack", "stop_gradient",
 )  # fmt: skip
 CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 
@@ -96,6 +96,7 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
             return _dot(x[0], x[1], params["dimension_numbers"])
         case "iota":
             return exact(equation.primitive.bind(**params))
+        # what may be true in a part of the interval alone is not decided
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decided(_compare(name, *x), continuous)
         case "sign":

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -42,8 +42,8 @@ def solvers() -> ModuleType:
     return cvxpy
 
 
-def check_choice(name: str, value: str, choices: TypeAliasType) -> None:
-    """Raise ValueError unless `value` is among a Literal's choices."""
+def check_choice(name: str, value: str, choices: Any) -> None:
+    """Raise ValueError unless `value` is among the choices of an alias of a Literal."""
     known = get_args(choices.__value__)
     if not isinstance(value, str) or value not in known:
         raise fail(name, f"one of {', '.join(known)}", shown(value))

@@ -8,7 +8,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
-from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units, rank, scalar
+from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
@@ -83,7 +83,7 @@ def _(channel: GainAndNoise) -> DisturbedGain:
 
 @disturbed_gain.register
 def _(channel: Series) -> DisturbedGain:
-    return reduce(_after, [disturbed_gain(part) for part in channel.maps])
+    return reduce(_after, [disturbed_gain(affine) for affine in channel.maps])
 
 
 def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
@@ -96,7 +96,7 @@ def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
 
 @disturbed_gain.register
 def _(channel: Mixture) -> DisturbedGain:
-    parts = [disturbed_gain(part) for part in channel.maps]
+    parts = [disturbed_gain(affine) for affine in channel.maps]
     widened = [_place(part, channel.inputs, parts, i) for i, part in enumerate(parts)]
     weights = np.asarray(channel.choice.probabilities)
     mean = np.tensordot(weights, [part.mean for part in widened], axes=1)
@@ -106,7 +106,7 @@ def _(channel: Mixture) -> DisturbedGain:
 
 @disturbed_gain.register
 def _(channel: Stack) -> DisturbedGain:
-    return _stack([disturbed_gain(part) for part in channel.maps], channel.inputs)
+    return _stack([disturbed_gain(affine) for affine in channel.maps], channel.inputs)
 
 
 def _known(matrix: np.ndarray) -> DisturbedGain:
@@ -311,7 +311,7 @@ def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
     """Make a matrix exactly symmetric."""
-    unit = own_units(matrix)
+    unit = standard_deviations(matrix)
     skew = np.abs(matrix - np.swapaxes(matrix, -1, -2))
     if np.any(skew > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):
         raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
@@ -320,5 +320,5 @@ def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float
 
 def smallest_eigenvalue(matrix: Float[np.ndarray, "w w"], units: Float[np.ndarray, "w"] | None = None) -> float:
     """Smallest eigenvalue after scaling the diagonal to 1 or -1, so that units do not decide its sign."""
-    unit = own_units(matrix) if units is None else units
+    unit = standard_deviations(matrix) if units is None else units
     return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])

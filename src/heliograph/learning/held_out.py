@@ -129,8 +129,8 @@ def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> 
         return None
 
 
-def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    likelihood, white = (np.asarray(part)[cut:] for part in innovations_of(item, z, u))
+def _expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+    likelihood, white = (np.asarray(part)[cut:] for part in innovations_of(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)

@@ -147,6 +147,6 @@ def _ratios(
 
 @compiled
 def _side_by_side(
-    item: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
+    filter: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jax.vmap(lambda single: expected_signals(item, single, u))(jnp.asarray(z))
+    return jax.vmap(lambda single: expected_signals(filter, single, u))(jnp.asarray(z))

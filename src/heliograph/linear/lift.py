@@ -81,6 +81,7 @@ def lifted_modes(
     before = second_moments(moments, n + 1, degree)
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
+    # Matrices of each distinct measurement and plant once.
     step_matrices, rounding, earlier = [], [], law
     distinct = {id(measurement): measurement for measurement in measurements}
     of_modes = {place: item.moments(degree) for place, item in distinct.items()}
@@ -95,10 +96,12 @@ def lifted_modes(
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             moments = np.asarray(push(plant, 2 * degree, moments))
         check_moments(moments, k, 2 * degree)
+        # Process noise: what the mode's draw adds, and the plant's.
         after, carried = second_moments(moments, n + 1, degree), moved @ before @ moved.T
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
         law = _stays(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
+        # Measurement noise: its mean over the modes.
         noise = np.zeros((1, 1))
         for p, matrix, route in zip(law, means, measurement.maps, strict=True):
             arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
@@ -119,7 +122,7 @@ def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"])
 
 T = TypeVar("T")
 HIGHEST = 31  # degree: C(62, 31) is below 2^63
-KEPT_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
+STORED_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 
 
 class Route(NamedTuple):
@@ -217,7 +220,7 @@ class Lifted:
         self.route, self.degree = route, degree
         self.matrix = np.asarray(route.moments(degree).matrix)
         rows, columns = (count(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
-        small = not varies and rows * columns <= KEPT_ENTRIES
+        small = not varies and rows * columns <= STORED_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
         local = degrees(route.outputs, degree)

@@ -12,7 +12,7 @@ from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
-from heliograph.numerics.check import array, fail, own_units
+from heliograph.numerics.check import array, fail, standard_deviations
 from heliograph.numerics.linalg import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -172,7 +172,7 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     # One more correction and prediction gives the gain, and must come back to where it began.
     start = covariance_step(prior, Steps(np.eye(len(a)), zero[0], np.zeros_like(q), c, zero[1], r))
     again = covariance_step(start.covariance, step).predicted
-    unit = own_units(prior)
+    unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
     if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ start.gain @ c) >= 1:
         raise _none("none that is approached")

@@ -55,8 +55,8 @@ class Sweep(Module):
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
         local, central = _over_filters(lambda step, later: step.estimate_from(step.smoothed(later)), steps, later)
         parts = [local.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
-        for item in self.fusions:
-            central |= item.step((), parts, jnp.asarray(0))[1]
+        for fusion in self.fusions:
+            central |= fusion.step((), parts, jnp.asarray(0))[1]
         return local, central
 
 
@@ -112,10 +112,10 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
 
 
 def _into_row(dt: int) -> Into:
-    def into(item: Sweep, history: History, place: Place) -> SmootherStep:
+    def into(sweep: Sweep, history: History, place: Place) -> SmootherStep:
         row, _ = place
-        state, received = item.start(history, row - 1), history.parts(row)[0]
-        return item.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
+        state, received = sweep.start(history, row - 1), history.parts(row)[0]
+        return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
 
     return into
 
@@ -124,15 +124,15 @@ def _earlier_row(history: History, place: Place) -> Place:
     return place[0] - 1, history.step[place[0] - 1]
 
 
-def _into_step(item: Sweep, history: History, place: Place) -> SmootherStep:
+def _into_step(sweep: Sweep, history: History, place: Place) -> SmootherStep:
     """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
     row, k = place
 
     def single(j: jax.Array, state: PyTree) -> PyTree:
-        return item.step(history, row, state, *history.at_step(row, j), j)[0]
+        return sweep.step(history, row, state, *history.at_step(row, j), j)[0]
 
-    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, single, item.start(history, row - 1))
-    return item.step(history, row, state, *history.at_step(row, k), k)[1]
+    state = jax.lax.fori_loop(history.step[row - 1] + 1, k, single, sweep.start(history, row - 1))
+    return sweep.step(history, row, state, *history.at_step(row, k), k)[1]
 
 
 def _earlier_step(history: History, place: Place) -> Place:
@@ -146,7 +146,7 @@ class Sweeper:
     def __init__(self, network: Network, dt: int | None):
         self.network = network
         kinds = tuple(k for k, kind in enumerate(network.kinds) if _can_smooth(_of(network, k, kind.filters[0])))
-        items = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
+        items = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         central = {name: item for name, item in items.items() if _can_smooth(item)}
         if not kinds and not central:
             raise fail(
@@ -159,8 +159,8 @@ class Sweeper:
             self._numbers, static = cast(self.item)
         self._run = sweep_back(static, dt)
 
-    def _fuses(self, item: Fused, kinds: tuple[int, ...]) -> bool:
-        return item.quantizers is None and all(kind in kinds for source in item.sources for kind, _ in source)
+    def _fuses(self, fusion: Fused, kinds: tuple[int, ...]) -> bool:
+        return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
     def estimates(self, history: History, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Return estimates after a row given the rows after it, by node and filter."""
@@ -188,13 +188,13 @@ def _of(network: Network, kind: int, name: str) -> AbstractFilter:
     return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
 
 
-def _can_smooth(item: AbstractFilter) -> bool:
+def _can_smooth(filter: AbstractFilter) -> bool:
     """Return whether a filter can be smoothed."""
-    u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
+    u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:
         with jax.enable_x64(True):
-            state = jax.tree.map(jnp.asarray, item.init())
-            eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), item, state)
+            state = jax.tree.map(jnp.asarray, filter.init())
+            eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
     except InputError:
         return False
     return True

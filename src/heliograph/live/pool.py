@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from heliograph.live.history import History
-from heliograph.live.player import Player
+from heliograph.live.lanes import Lanes
+from heliograph.numerics.types import Float
 
 FEWEST = 1024  # rows of the table at first; it doubles when it is full
 SHORTEST = 64  # rows of a history
@@ -18,10 +19,10 @@ class Pool:
     last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
     """
 
-    def __init__(self, player: Player, alone: bool = False):
-        self.player, self.step_rows, self._alone = player, player.step_rows, alone
+    def __init__(self, lanes: Lanes, alone: bool = False):
+        self.lanes, self.step_rows, self._alone = lanes, lanes.step_rows, alone
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
-        ends = np.cumsum([*sizes, player.given, 1, player.received + player.given + 1])
+        ends = np.cumsum([*sizes, lanes.given, 1, lanes.received + lanes.given + 1])
         self.state, self.outputs, self.held, self.at, self.numbers = (
             slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
         )
@@ -58,11 +59,11 @@ class Pool:
         The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
         number is at most `last`.
         """
-        dt, table = self.player.dt, self.table
+        dt, table = self.lanes.dt, self.table
         u = np.where(np.isnan(given), table[before, self.held], given)
-        u = u if dt is None else np.insert(u, dt, 1.0, axis=1)
+        u = u if dt is None else _with_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
-        nothing = np.full((len(before), self.player.received), np.nan)
+        nothing = np.full((len(before), self.lanes.received), np.nan)
         done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
         return done[:, self.step_rows.state.size :]
 
@@ -72,29 +73,20 @@ class Pool:
         In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
         received at the last of these.
         """
-        dt, table = self.player.dt, self.table
+        dt, table = self.lanes.dt, self.table
         numbers, held = table[after, self.numbers], table[before, self.held]
-        received, given = numbers[:, : self.player.received], numbers[:, self.player.received : -1]
+        received, given = numbers[:, : self.lanes.received], numbers[:, self.lanes.received : -1]
         now_held = np.where(np.isnan(given), held, given)
         if dt is None:
             there = (at == numbers[:, -1])[:, None]
             received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
             now_held, k = u, at
         else:
-            u = np.insert(held, dt, numbers[:, -1] - table[before, -1], axis=1)
+            u = _with_time_step(held, dt, numbers[:, -1] - table[before, -1])
             k = table[before, self.at.start] + 1
         done = self.step_rows(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1), self._alone)
         table[after, : self.outputs.stop] = done
         table[after, self.held], table[after, self.at.start] = now_held, k
-
-    def reach(self, before: int, after: int) -> None:
-        """Step from the row in one slot into that in another, in discrete time through all steps between them."""
-        if self.player.dt is not None:
-            self.step(np.array([before]), np.array([after]), np.zeros(1))
-            return
-        for at in range(int(self.table[before, self.at.start]) + 1, int(self.table[after, -1]) + 1):
-            self.step(np.array([before]), np.array([after]), np.array([float(at)]))
-            before = after
 
     def history(self, slots: Sequence[int]) -> History:
         """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
@@ -102,3 +94,8 @@ class Pool:
         rows, steps = self.table[[*slots, *[slots[-1]] * (length - len(slots))]], self.step_rows
         state, outputs = steps.state.tree(rows[:, self.state]), steps.outputs.tree(rows[:, self.outputs])
         return History(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
+
+
+def _with_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:
+    """Insert the time steps among the inputs, as number `dt`."""
+    return np.concatenate([u[:, :dt], steps[:, None], u[:, dt:]], axis=1)

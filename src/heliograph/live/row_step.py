@@ -1,7 +1,7 @@
 """Step of all filters of a network on rows of doubles: native code for many rows if possible, else XLA."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import equinox as eqx
@@ -131,12 +131,15 @@ class RowStep:
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
         self._choice = chosen(_stepped(self._layout), (self._numbers, row), (False, True))
+        code = self._choice.code
+        self._code = None if code is None else code.with_first(*self._numbers)
 
     @property
     def engine(self) -> str:
         """Return which engine steps the filters, and why."""
         return self._choice.explained
 
+    @cached_property
     def program(self) -> str:
         """Return the lowered step as text, which two processes compare to see that they compute the same."""
         with jax.enable_x64(True):
@@ -145,8 +148,8 @@ class RowStep:
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
-        if self._choice.code is not None:
-            result: np.ndarray = self._choice.code(*self._numbers, rows)
+        if self._code is not None:
+            result: np.ndarray = self._code(rows)
             return result
         width, together = (1, 1) if alone else (WIDTH, TOGETHER)
         run = _by_xla(self._layout, width, together)

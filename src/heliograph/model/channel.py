@@ -184,9 +184,9 @@ def mean_gain(channel: Channel) -> Channel:
         ValueError: a gain law that does not know its mean, a channel that remembers.
     """
 
-    def mean_of(item: AbstractRandomAffine) -> AbstractRandomAffine:
-        check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [item])[0])
-        return item.mean_gain()
+    def mean_of(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+        check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [channel])[0])
+        return channel.mean_gain()
 
     result: Channel = at_each_step(mean_of, channel)
     return result
@@ -253,7 +253,7 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             return carried(channel.link, sent)
         # All choices must agree.
         case Mixture() | Modes():
-            results = {carried(part, sent) for part in channel.maps}
+            results = {carried(affine, sent) for affine in channel.maps}
             if len(results) == 1:
                 return results.pop()
     raise _refused(type(channel).__name__)

@@ -66,7 +66,7 @@ def markov_fading(
     if isinstance(transition, MarkovChain) and name is not None:
         raise fail("name", "none beside a chain, which has its own", repr(name))
     chain = transition if isinstance(transition, MarkovChain) else MarkovChain(transition, name=name)
-    channels = [item for item in gains if isinstance(item, AbstractRandomAffine)] if isinstance(gains, Sequence) else []
+    channels = [gain for gain in gains if isinstance(gain, AbstractRandomAffine)] if isinstance(gains, Sequence) else []
     if channels:
         if noise is not None:
             raise fail("noise", "none beside channels, which have their own", "one")

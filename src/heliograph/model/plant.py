@@ -259,7 +259,7 @@ def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ..
 
 
 def check_turns(
-    name: str, function: Callable[[jax.Array], jax.Array], center: Vector, given: Angles, result: Angles
+    name: str, function: Callable[[jax.Array], jax.Array], center: Vector, given: Angles, angles: Angles
 ) -> None:
     """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found."""
     if not given or is_traced(center):
@@ -268,7 +268,7 @@ def check_turns(
         start = np.asarray(function(jnp.asarray(center)))
         for i in given:
             moved = np.asarray(function(jnp.asarray(center + TURN * np.eye(len(center))[i])))
-            change = wrapped(moved - start, result)
+            change = wrapped(moved - start, angles)
             if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
                 raise fail(f"{name} with circular states", "one that a full turn does not change",
                            f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip

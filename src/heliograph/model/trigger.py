@@ -94,13 +94,13 @@ class AbstractTrigger(Module):
 
     def reasons(self, sender: Sender, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Return the reason for which each component is sent, (m,); 0 where it is not."""
-        reason = jnp.where(self.event(y - sender.reference, key, k), self._own_reason(), SendReason.SILENT)
+        reason = jnp.where(self.event(y - sender.reference, key, k), self._event_reason(), SendReason.SILENT)
         if self.heartbeat is not None:
             due = sender.age + 1 >= self.heartbeat
             reason = jnp.where(due & (reason == SendReason.SILENT), SendReason.HEARTBEAT, reason)
         return jnp.where(sender.begun, reason, SendReason.FIRST)
 
-    def _own_reason(self) -> int:
+    def _event_reason(self) -> int:
         return SendReason.EVENT
 
     def after(self, sender: Sender, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> Sender:
@@ -295,7 +295,7 @@ class Periodic(AbstractTrigger):
         """k = phase (mod period)."""
         return jnp.full(len(error), k % self.period == self.phase)
 
-    def _own_reason(self) -> int:
+    def _event_reason(self) -> int:
         return SendReason.SCHEDULE
 
 

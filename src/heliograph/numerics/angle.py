@@ -51,7 +51,7 @@ def wrapped(value: A, angles: Angles) -> A:
 
 
 def continued(
-    function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, result: Angles
+    function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, angles: Angles
 ) -> Callable[[jax.Array], jax.Array]:
     """Return the function with its angular results continued from `center`, so that no jump is taken for a change.
 
@@ -59,11 +59,11 @@ def continued(
     to whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is
     taken within half a turn of its value at the center.
     """
-    if not result:
+    if not angles:
         return function
     start, size = function(center), center.shape[0]
     turns = jnp.zeros((*start.shape, size))
     for i in given:
         slope = jax.jvp(function, (center,), (jnp.zeros_like(center).at[i].set(1.0),))[1]
         turns = turns.at[:, i].set(jnp.round(slope))
-    return lambda x: nearest(function(x), start + turns @ (x - center), result)
+    return lambda x: nearest(function(x), start + turns @ (x - center), angles)

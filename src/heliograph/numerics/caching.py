@@ -1,7 +1,7 @@
 """Results computed from an immutable object, cached as long as the object lives."""
 
 from collections.abc import Callable, Hashable
-from functools import wraps
+from functools import cache, wraps
 from inspect import signature
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 from weakref import ref
@@ -48,6 +48,22 @@ def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, 
         return result
 
     return cast(Callable[Concatenate[S, P], T], known)
+
+
+def cached_arrays(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function of arguments to be hashed with its results cached, copied at each call.
+
+    JAX converts a NumPy array that a trace closes over to the precision of that trace once for all traces: after one in
+    single precision the same array is single in a double one, or an index of another type than the length it meets.
+    """
+    known = cast(Callable[P, T], cache(function))
+
+    @wraps(function)
+    def copied(*args: P.args, **kwargs: P.kwargs) -> T:
+        result: T = jax.tree.map(np.copy, known(*args, **kwargs))
+        return result
+
+    return copied
 
 
 def _close(leaf: Any) -> None:

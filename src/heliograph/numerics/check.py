@@ -295,7 +295,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     if is_traced(result):
         return (result + result.T) / 2
     # Symmetry and definiteness are judged of correlations, so that neither depends on units.
-    unit = own_units(result)
+    unit = standard_deviations(result)
     skew = np.abs(result - result.T)
     if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
         raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
@@ -305,7 +305,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     return (result + result.T) / 2
 
 
-def own_units(matrix: np.ndarray) -> np.ndarray:
+def standard_deviations(matrix: np.ndarray) -> np.ndarray:
     """Return standard deviations (..., n) of covariances (..., n, n), by which a matrix is judged in any units.
 
     A component of variance zero has the least deviation that its off-diagonal entries allow, 1 if all are zero.

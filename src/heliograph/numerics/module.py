@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.names import refuse_attribute
+
 
 def same(item: Any, other: Any) -> bool:
     """Return one bool for objects that hold arrays: of the same class, and the same in each part.
@@ -76,7 +78,12 @@ FEW, SOME, LARGE = 4, 8, 20  # numbers of an array, items on a line, rows of a t
 
 
 def readable(kind: T) -> T:
-    """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer."""
+    """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer.
+
+    An attribute that there is not is refused with the names most like it.
+    """
+    if not hasattr(kind, "__getattr__"):
+        kind.__getattr__ = refuse_attribute  # type: ignore[attr-defined]
     for name, method in (("__repr__", _repr), ("_repr_html_", _html), ("__eq__", _equal)):
         setattr(kind, name, method)
     return kind

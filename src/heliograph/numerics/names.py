@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
+from typing import NoReturn
 
 import lazy_loader
 
@@ -11,7 +12,9 @@ MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing
 MEANT = {  # what others call it, in plain letters
     "kf": "kalmanfilter", "ekf": "extendedfilter", "ckf": "cubaturefilter", "ukf": "unscentedfilter",
-    "filter": "kalmanfilter", "batch": "run", "batchfilter": "run",
+    "filter": "kalmanfilter", "batch": "run", "batchfilter": "run", "update": "push", "x": "means", "p": "covariances",
+    "f": "matrix", "h": "matrix", "q": "noise", "r": "noise",
+    "dare": "steadystate", "dlqe": "steadystate", "readcsv": "readrecording", "smooth": "rtssmoother",
 }  # fmt: skip
 
 
@@ -25,6 +28,23 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
         raise AttributeError(f"{package} has no attribute {name!r}{offered(name, _public(package, names))}")
 
     return attribute, listed, names
+
+
+def refuse_attribute(item: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
+    """Refuse an attribute that an object does not have, with what to write instead, or the names most like it.
+
+    What stands in `remedies`, by name, comes first, then a function of heliograph that has the name.
+    """
+    kind = type(item)
+    if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
+        object.__getattribute__(item, name)
+    public = {other: other for other in object.__dir__(item) if not other.startswith("_")}
+    remedy = offered(name, public)
+    if not remedy and name in import_module("heliograph").__all__:
+        remedy = f"; write hg.{name}(...)"
+    if remedies and name in remedies:
+        remedy = f"; write {remedies[name]}"
+    raise AttributeError(f"{kind.__name__} has no attribute {name!r}{remedy}")
 
 
 def offered(name: str, known: Mapping[str, str]) -> str:
@@ -51,7 +71,9 @@ def _plain(name: str) -> str:
 def _public(package: str, names: list[str]) -> dict[str, str]:
     """Return the package's names as they are written after it; of heliograph itself also those of its rooms."""
     known = {name: name for name in names}
-    if "." not in package:
+    if "." in package:
+        known |= {name: f"heliograph.{name}" for name in import_module("heliograph").__all__ if name not in known}
+    else:
         for room in names:
             public = getattr(import_module(f"{package}.{room}"), "__all__", []) if _is_room(package, room) else []
             known |= {name: f"{room}.{name}" for name in public if name not in known}

@@ -22,7 +22,7 @@ from heliograph.relays.design import given_design, receiver_behind_relays, relay
 from heliograph.relays.periodic import (
     periodic_behind_relays,
     periodic_given_design,
-    periodic_own_error_design,
+    periodic_local_error_design,
     periodic_relays_for_best_receiver,
 )
 from heliograph.simulation.network import Network
@@ -155,7 +155,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         raise fail("budget of relays that filter", "a total for each slot", "other limits")
     # Errors of the designed gains, and of those that minimise each relay's error.
     gains = periodic_relays_for_best_receiver(relays, power_limit=None if limits is None else limits.total)
-    local = periodic_own_error_design(relays).gains
+    local = periodic_local_error_design(relays).gains
     spread, before = (periodic_behind_relays(relays, design) for design in (gains, local))
     value, present = (float(np.trace(design, axis1=1, axis2=2).mean()) for design in (spread, before))
     # What relays and sensor send.

@@ -146,20 +146,20 @@ def _feedback_filters(network: Network) -> dict[str, FedBackFilter]:
     return {name: f for name, node in nodes.items() for f in node.filters.values() if isinstance(f, FedBackFilter)}
 
 
-def _innovation_moments(item: FedBackFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
+def _innovation_moments(filter: FedBackFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
     """C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
-    if horizon is None or item.claim != "exact":
+    if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
-        raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else item.claim)
-    state, moments = item.init(), []
+        raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
+    state, moments = filter.init(), []
     for k, u in enumerate(inputs):
-        state = item.predict(state, u, k)
-        sensor = at(item.base.sensor, k)
+        state = filter.predict(state, u, k)
+        sensor = at(filter.base.sensor, k)
         c = np.asarray(sensor.matrix)
         moment = np.eye(len(c) + 1)
         moment[:-1, :-1] = c @ np.asarray(state.covariance) @ c.T + np.asarray(sensor.noise.covariance)
         moments.append(moment)
-        state, _ = item.correct(state, np.zeros(item.received), k)
+        state, _ = filter.correct(state, np.zeros(filter.received), k)
     return np.array([moments])
 
 
@@ -168,7 +168,7 @@ def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndar
     relays = network.relays
     assert relays is not None
     filters = {name: network.nodes[name].filters[LOCAL] for name in relays.relays}
-    schedules = {name: item.gains.values for name, item in filters.items() if isinstance(item, ScheduledFilter)}
+    schedules = {name: filter.gains.values for name, filter in filters.items() if isinstance(filter, ScheduledFilter)}
     known = min(len(schedule.gain) for schedule in schedules.values())
     steps = known if horizon is None else check_horizon(horizon, known)
     moved = relays.steps(steps)

@@ -79,6 +79,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
     """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
     match channel:
+        # A hop that transmits is visited; a wire is not.
         case AbstractHop():
             if not transmits(channel):
                 return channel, place
@@ -88,7 +89,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             visited, place = _visit_chain(channel.maps, visit, place)
         case Stack():
             places = [Place(f"{place.prefix}part{i}.", 0, place.signal) for i in range(1, len(channel.maps) + 1)]
-            visited = [_visit(part, visit, at)[0] for part, at in zip(channel.maps, places, strict=True)]
+            visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
             several = isinstance(channel, Mixture) and sum(not is_silent(part) for part in channel.maps) > 1
@@ -99,6 +100,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
             return channel, place
+        # What wraps a link: inside it.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
             inside = place
@@ -112,6 +114,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
+    # The same object where nothing has changed.
     if all(part is before for part, before in zip(visited, channel.maps, strict=True)):
         return channel, place
     return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), place
@@ -122,11 +125,11 @@ def _visit_chain(
 ) -> tuple[list[AbstractRandomAffine], Place]:
     """The changed maps of a series, each of which receives what comes through those before it."""
     parts, signal = [], place.signal
-    for i, part in enumerate(maps):
-        changed, place = _visit(part, visit, place._replace(signal=signal))
+    for i, affine in enumerate(maps):
+        changed, place = _visit(affine, visit, place._replace(signal=signal))
         parts.append(changed)
         if signal is not None and i + 1 < len(maps):
-            signal = Signal(_behind(part, signal.second), signal.arrives * _arrival(part))
+            signal = Signal(_behind(affine, signal.second), signal.arrives * _arrival(affine))
     return parts, place
 
 
@@ -138,7 +141,7 @@ def _arrival(channel: AbstractRandomAffine) -> Scalar:
         case Erasure():
             return plain(channel.arrival) * _arrival(channel.base)
         case Series():
-            return prod(_arrival(part) for part in channel.maps)
+            return prod(_arrival(affine) for affine in channel.maps)
         case Delayed():
             return _arrival(channel.link)
     raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
@@ -150,8 +153,8 @@ def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
         case Erasure():
             return _behind(channel.base, second)
         case Series():
-            for part in channel.maps:
-                second = _behind(part, second)
+            for affine in channel.maps:
+                second = _behind(affine, second)
             return second
         case Delayed():
             return _behind(channel.link, second)

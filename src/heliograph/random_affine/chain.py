@@ -1,7 +1,6 @@
 """Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent."""
 
 from copy import copy
-from functools import cache
 from math import comb, factorial
 from typing import NamedTuple
 from uuid import uuid4
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
+from heliograph.numerics.caching import cached_arrays
 from heliograph.numerics.check import (
     PROBABILITY,
     PROBABILITY_TOLERANCE,
@@ -249,7 +249,7 @@ def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     return binomial
 
 
-@cache
+@cached_arrays
 def _hermite(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
     x, w = hermegauss(count)

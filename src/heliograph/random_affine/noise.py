@@ -18,7 +18,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import drawn_index
 from heliograph.random_affine.moments.monomials import Exponents, exponents
 
-OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance
+FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
 
 Number = float | jax.Array
 Vector = Float[jax.Array | np.ndarray, " n"]
@@ -110,7 +110,7 @@ def _root(covariance: Square) -> np.ndarray:
         values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
         rounding = 10 * len(values) * np.finfo(float).eps * np.max(values, initial=0.0)
         factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.where(values > rounding, values, 0.0)))
-        if np.all(np.abs(factor @ factor.T - matrix) <= OWN_DIGITS * np.outer(unit, unit)):
+        if np.all(np.abs(factor @ factor.T - matrix) <= FACTOR_TOLERANCE * np.outer(unit, unit)):
             break
     return factor
 

@@ -4,12 +4,12 @@ from .design import (
     RelayDesign as RelayDesign,
     given_design as given_design,
     relay_schedules as relay_schedules,
-    own_error_design as own_error_design,
+    local_error_design as local_error_design,
 )
 from .periodic import (
     periodic_behind_relays as periodic_behind_relays,
     periodic_given_design as periodic_given_design,
-    periodic_own_error_design as periodic_own_error_design,
+    periodic_local_error_design as periodic_local_error_design,
 )
 from .periodic import (
     periodic_receiver_error_design as periodic_receiver_error_design,

@@ -175,7 +175,7 @@ def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -
     return result
 
 
-def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
+def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
     K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides

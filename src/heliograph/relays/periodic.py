@@ -49,13 +49,13 @@ def periodic_steps(network: RelayNetwork) -> Steps:
     return result
 
 
-def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
-    """Return the steady state of `own_error_design` of a `network`: gains and moments over one period.
+def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
+    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
 
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
-    result, change = _solve_own_steady(periodic_steps(network), start_moments(network))
+    result, change = _solve_local_steady(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
     return as_design(network, result)
@@ -190,7 +190,7 @@ def _period(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array,
 
 
 @compiled
-def _solve_own_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
+def _solve_local_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
     moments, change = _solve_steady(lambda m: propagate(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
@@ -232,7 +232,7 @@ def periodic_receiver_error_design(
 
     Args:
         network: the network, which varies with its slots only.
-        start: gains to begin with, {filter: (slots, n, received)}; the steady `own_error_design` unless given.
+        start: gains to begin with, {filter: (slots, n, received)}; the steady `local_error_design` unless given.
         power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
 
     Raises:
@@ -240,7 +240,7 @@ def periodic_receiver_error_design(
             limit that no gains were found to meet.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    design = periodic_own_error_design(network)
+    design = periodic_local_error_design(network)
     gains = join_gains(network, design.gains if start is None else start)
     return periodic_given_design(network, split_gains(network, _tune(network, gains, _receiver_cost, power_limit)))
 
@@ -252,7 +252,7 @@ def periodic_relays_for_best_receiver(
 
     Args:
         network: the network, which varies with its slots only.
-        start: relay gains to begin with, {relay: (slots, n, received)}; the steady `own_error_design` unless given.
+        start: relay gains to begin with, {relay: (slots, n, received)}; the steady `local_error_design` unless given.
         power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
 
     Returns:
@@ -262,7 +262,7 @@ def periodic_relays_for_best_receiver(
         ValueError: as for `periodic_receiver_error_design`; no relays.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    gains = relay_gains(network, periodic_own_error_design(network).gains if start is None else start)
+    gains = relay_gains(network, periodic_local_error_design(network).gains if start is None else start)
     tuned = split_gains(network, _tune(network, gains, _behind_cost, power_limit))
     return {name: gain for name, gain in tuned.items() if name != RECEIVER}
 
@@ -279,11 +279,13 @@ def _tune(
         used[:, :, -network.received[-1] :] = False
     where = np.nonzero(used)
     unit = _units(network, start)[where]
+    # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
+    # Augmented Lagrangian: descend, then raise the multipliers of slots above their limit.
     for _ in range(ROUNDS if power_limit is not None else 1):
 
         def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
@@ -295,6 +297,7 @@ def _tune(
         if _within_limits(power / (limit * (1 - MARGIN)) - 1, multipliers):
             break
         multipliers = np.maximum(0.0, multipliers + STIFFNESS * (power / (limit * (1 - MARGIN)) - 1))
+    # Gains in their units again.
     if np.any(power > limit * (1 + POWER_TOLERANCE)):
         raise fail("power limit", "one that some gains meet", f"an excess of {np.max(power / limit) - 1:.2g}")
     tuned: np.ndarray = start.copy()

@@ -16,7 +16,7 @@ from heliograph.relays.design import (
     RelayDesign,
     given_design,
     join_gains,
-    own_error_design,
+    local_error_design,
     receiver_weight,
     split_gains,
     start_moments,
@@ -211,7 +211,7 @@ def receiver_error_design(
 
     The cost is quadratic in the gains of one step while the others stay: tr Lam_k [I -K] Z_k [I -K]', with moments Z
     from the steps before and the gradient Lam of the cost to come. A sweep goes backward and then forward and
-    minimises exactly at each step, so the cost never rises; it starts from `own_error_design`. The result is a local
+    minimises exactly at each step, so the cost never rises; it starts from `local_error_design`. The result is a local
     minimum, so an upper bound on the best.
 
     With a power limit the gains of all steps move at once, inside a logarithmic barrier that is lowered bit by bit, in
@@ -232,7 +232,7 @@ def receiver_error_design(
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     check_count("sweeps", sweeps)
-    design = own_error_design(network, horizon)
+    design = local_error_design(network, horizon)
     weights = 1 / (horizon * design.trace("receiver")[1:]) if weights is None else array("weights", weights, (horizon,))
     if np.any(weights < 0) or sweeps < 1:
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")

@@ -47,8 +47,8 @@ def linear_maps(p: Steps) -> LinearMaps:
     estimates = state[0] - state[1:]  # s_f = x - e_f
     relayed = jnp.einsum("mn,fnc->fmc", p.sensing, estimates[:-1])
     sent = jnp.concatenate([(p.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
-    own_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
-    believed = jnp.stack([jnp.asarray(c) for c in own_sends])
+    local_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
+    believed = jnp.stack([jnp.asarray(c) for c in local_sends])
     expects = jnp.asarray(p.gain) @ believed.reshape(-1, n)  # prediction of each row, as a map of its filter's estimate
     local = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
     return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - local, sent)
@@ -91,7 +91,7 @@ def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
     return np.asarray(np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner)
 
 
-def own_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
+def local_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
     """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
@@ -125,7 +125,7 @@ def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "tim
     def single(moments: jax.Array, item: tuple[Steps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = item
         z, sent = step_moments(p, moments)
-        used = own_gain(z, p) if gain is None else gain * p.live
+        used = local_gain(z, p) if gain is None else gain * p.live
         after = correct(z, used)
         return after, (used if gain is None else gain, after, sent.power)
 

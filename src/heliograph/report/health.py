@@ -78,17 +78,17 @@ class Health:
 
     def doubted(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts."""
-        return [item for item in self.filters if item.trusted and any(_doubts(item))]
+        return [filter for filter in self.filters if filter.trusted and any(_doubts(filter))]
 
     def remarks(self) -> list[str]:
         """Return one line for each doubt about a filter that is there to be compared with."""
-        return [line for item in self.filters if not item.trusted for line in _doubts(item)]
+        return [line for filter in self.filters if not filter.trusted for line in _doubts(filter)]
 
 
-def _doubts(item: FilterHealth) -> Iterator[str]:
-    if item.test is None:
+def _doubts(health: FilterHealth) -> Iterator[str]:
+    if health.test is None:
         return
-    name, test = f"{item.node}/{item.filter}", item.test
+    name, test = f"{health.node}/{health.filter}", health.test
     if test.power > 1 + SURE * test.power_error:
         yield (
             f"{name} is too sure: the mean square of its innovations is {test.power:.2f} times what it claims; "

@@ -32,12 +32,12 @@ class Errors(NamedTuple):
 
 
 def errors_of(record: Record) -> list[Errors]:
-    """Compare each filter with the truth; nothing without one."""
+    """Compare each filter with the truth, the fused ones first; nothing without one."""
     if record.truth is None:
         return []
     known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
     results = []
-    for node, estimates in record.estimates.items():
+    for node, estimates in sorted(record.estimates.items(), key=lambda item: item[0] != FUSED):
         for name, estimate in estimates.items():
             values = record.nees(node, name)
             judged = ~np.isnan(values)
@@ -88,7 +88,7 @@ def listeners(network: Network, record: Record) -> Iterator[Listener]:
     received, relied_on = record.measurements, _relied_on(network)
     for node, z in received.items():
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
-        weighing = {name for name, item in filters.items() if item.received and weighs(item)}
+        weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
         blaming = weighing & relied_on[node] or weighing
         for name, item in filters.items():
             yield Listener(node, name, item, z, names, name in relied_on[node], name in blaming)
@@ -106,17 +106,17 @@ def _relied_on(network: Network) -> dict[str, set[str]]:
     fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
     results = {}
     for node, place in network.nodes.items():
-        claims = {name: STRENGTH[claim_at(place, item)] for name, item in place.filters.items()}
+        claims = {name: STRENGTH[claim_at(place, filter)] for name, filter in place.filters.items()}
         strongest = [name for name, s in claims.items() if s == max(claims.values())]
         results[node] = fused & set(claims) or set(strongest[:1])
     return results
 
 
-def weighs(item: AbstractFilter) -> bool:
+def weighs(filter: AbstractFilter) -> bool:
     """Ask whether a filter weighs the components of what arrives."""
     with jax.enable_x64(True):
-        state = jax.tree.map(jnp.asarray, item.init())
-        innovation = jax.eval_shape(lambda before, z: item.correct(before, z)[1], state, np.zeros(item.received))
+        state = jax.tree.map(jnp.asarray, filter.init())
+        innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
     return innovation.weight is not None
 
 
@@ -168,22 +168,22 @@ def weighed_outputs(network: Network, record: Record, inputs: np.ndarray) -> lis
     return [output for item in chosen for output in outputs_of(item, inputs)]
 
 
-def output_numbers(item: OutputHealth) -> dict[str, Json]:
+def output_numbers(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output for a summary; None where there are none."""
-    summary = item.summary
+    summary = health.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
                                 "squared": summary.squared}  # fmt: skip
-    if item.weighs:
+    if health.weighs:
         values |= {"weight": summary.weight, "share": summary.share.estimate, "share_low": summary.share.low,
                    "share_high": summary.share.high}  # fmt: skip
     counted: dict[str, Json] = {"expected": summary.expected, "received": summary.received}
-    if item.weighs:
-        counted |= {"down_weighted": summary.down_weighted, "to_blame": item.to_blame}
+    if health.weighs:
+        counted |= {"down_weighted": summary.down_weighted, "to_blame": health.to_blame}
     return counted | {name: None if np.isnan(value) else value for name, value in values.items()}
 
 
-def output_row(item: OutputHealth) -> dict[str, Json]:
+def output_row(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output with its names, and in words."""
-    words = str(item.summary) + ("; to blame" if item.to_blame else "")
-    named: dict[str, Json] = {"node": item.node, "filter": item.filter, "output": item.output, "words": words}
-    return named | output_numbers(item)
+    words = str(health.summary) + ("; to blame" if health.to_blame else "")
+    named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": health.output, "words": words}
+    return named | output_numbers(health)

@@ -58,7 +58,9 @@ def _ordered(record: Record) -> list[str]:
 
 def _tested(health: Health) -> dict[str, list[FilterHealth]]:
     """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
-    tested = sorted((item for item in health.filters if item.white is not None), key=lambda item: item.node != FUSED)
+    tested = sorted(
+        (filter for filter in health.filters if filter.white is not None), key=lambda item: item.node != FUSED
+    )
     if len(tested) <= FEW:
         return {"innovations": tested} if tested else {}
     nodes: dict[str, list[FilterHealth]] = {}
@@ -252,9 +254,9 @@ def _compared(health: Health) -> list[Text | Points]:
 
 
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture | Choice]:
-    # One row for each filter: size, correlation and p-value of its innovations.
+    # One row for each filter, fused ones first: size, correlation and p-value of its innovations.
     rows = []
-    for tested_filter in health.filters:
+    for tested_filter in sorted(health.filters, key=lambda item: item.node != FUSED):
         test, name = tested_filter.test, visible(f"{tested_filter.node}/{tested_filter.filter}")
         if test is None:
             rows.append([name, tested_filter.claim, "–", "–", "–"])
@@ -284,26 +286,34 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
                                  f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
         for name, filters in tested.items()
     }  # fmt: skip
-    drawn = {item.node for filters in tested.values() for item in filters}
+    drawn = {filter.node for filters in tested.values() for filter in filters}
     left = [
         f"{item.node}/{item.filter}" for item in health.filters if item.white is not None and item.node not in drawn
     ]
     table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
+    # Fusions of estimates, which are in no row.
+    listed = {(item.node, item.filter) for item in health.filters}
+    fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
+    if fusions:
+        text += (
+            f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
+            "fuses are tested here, and itself on the live page of `heliograph serve`."
+        )
     return [Text([text]), table, *_chosen(pictures), *_not_drawn(left, "Their numbers are in the table.")]
 
 
 def outputs_table(health: Health) -> list[Table]:
     """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
     rows = []
-    for item in health.outputs:
+    for output in health.outputs:
         # Numbers of the summary; the bias to the digits that its interval holds.
-        s = item.summary
-        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if item.weighs else "–"
+        s = output.summary
+        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
-        name = visible(f"{item.node}/{item.filter}: {item.output}")
+        name = visible(f"{output.node}/{output.filter}: {output.output}")
         bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
         rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
-                     "to blame" if item.to_blame else ""])  # fmt: skip
+                     "to blame" if output.to_blame else ""])  # fmt: skip
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "

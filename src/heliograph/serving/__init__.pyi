@@ -1,13 +1,9 @@
 """Public names of the room, which needs the extra `live`; the package loads them when first used."""
 
-from .lanes import (
-    Lanes as Lanes,
-)
-from .fleet import (
-    Fleet as Fleet,
-    Options as Options,
-)
 from .service import (
+    Fleet as Fleet,
+    Lanes as Lanes,
+    Options as Options,
     Service as Service,
 )
 from .message import (

@@ -6,23 +6,25 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from heliograph.model.estimate import Claim
 
-Kind = Literal["provisional", "final", "refused"]
+Kind = Literal["provisional", "final", "refused", "message"]
 
 
 class Output(NamedTuple):
     """A line of JSON about a plant, to be published.
 
     Args:
-        number: running count of the outputs that are published exactly once; None for provisional estimates.
+        number: running count of the outputs that are published exactly once; None for others.
         plant: name of the plant.
-        kind: "provisional", "final" or "refused".
+        kind: "provisional", "final" or "refused"; "message" to the service of another node.
         body: the line of JSON, without newline.
+        to: the node to whose service a message goes.
     """
 
     number: int | None
     plant: str
     kind: Kind
     body: bytes
+    to: str = ""
 
 
 class WeighedOutputs(BaseModel):

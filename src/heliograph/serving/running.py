@@ -5,23 +5,26 @@ import contextlib
 import os
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 from typing import Protocol
 
+from heliograph.files.sources import Source
+from heliograph.live.event import INPUTS
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import check_count, fail
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, Part, TakenOverError, connected
+from heliograph.serving.brokers.transport import LOG, Part, TakenOverError, connected, word
 from heliograph.serving.brokers.url import Address
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import Damage, InMemoryStore, StoreProtocol, identity
+from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
@@ -155,14 +158,41 @@ class ServiceSettings:
                 )
 
 
-def store_of(network: str, given: str | None, parts: int | None) -> str | None:
-    """Return the place of the store as requested, else a file in this folder named after the network.
+def store_of(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
+    """Return the place of the store as requested, else a file in this folder named after the network and its node.
 
     None keeps no state. Processes that share parts must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
-    return f"{name_of(network)}.db"
+    return f"{name_of(network)}{'' if node is None else f'-{word(node)}'}.db"
+
+
+def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
+    """Return the settings of one node of a fusion between neighbours, at the topic of its name below the broker's.
+
+    Raises:
+        ValueError: no such node, no broker between the nodes, parts that processes share.
+    """
+    if settings.broker is None or settings.parts is not None:
+        raise fail("--node", "a broker between the nodes (--broker URL), and no --parts",
+                   "none" if settings.broker is None else "--parts")  # fmt: skip
+    # Messages of its own sensor, where they are of topics of others; the seconds of a step are those of all nodes.
+    table, step = settings.sources, settings.options.step
+    if isinstance(table, Mapping):
+        items = {topic: list(rows) if isinstance(rows, Sequence) else [rows] for topic, rows in table.items()}
+        step = next((row.step for rows in items.values() for row in rows if isinstance(row, Source)), step)
+        mine = {topic: [row for row in rows if getattr(row, "node", node) in (node, INPUTS)]
+                for topic, rows in items.items()}  # fmt: skip
+        table = {topic: rows for topic, rows in mine.items() if rows} or None
+    return replace(
+        settings,
+        network=node_network(settings.network, node),
+        options=settings.options._replace(step=step),
+        broker=replace(settings.broker, topic=f"{settings.broker.topic}/{word(node)}"),
+        sources=table,
+        name=f"{settings.name} {node}",
+    )
 
 
 def name_of(network: str) -> str:
@@ -177,8 +207,8 @@ async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     async with _watched(settings) as look:
         lanes = Lanes(settings.network)
-        if lanes.player.uneven:
-            what = f"predictions depend on when others are asked for: {lanes.player.uneven}"
+        if lanes.uneven:
+            what = f"predictions depend on when others are asked for: {lanes.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
         if settings.parts is None:
             await _alone(settings, lanes, look)
@@ -208,7 +238,7 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     # The store first, whose state the service goes on from.
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network)
-    step = None if reads is None else reads.sources.step
+    step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(lanes, settings.options._replace(step=step))
     store = _open_store(settings, fleet)
     resumed, service = store.count() > 0, Service(fleet, store, _say)
@@ -231,7 +261,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Open the store, with the snapshot and the plants to begin anew, and report its state."""
     if settings.store is None:
         return InMemoryStore()
-    from heliograph.serving.storage.plant_codec import Carrier
+    from heliograph.serving.storage.carrier import Carrier
     from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)

@@ -13,14 +13,18 @@ from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, Verdict
+from heliograph.live.fleet import Finalised
+from heliograph.live.fleet import Fleet as Fleet
+from heliograph.live.fleet import Options as Options
+from heliograph.live.lanes import Lanes as Lanes
+from heliograph.live.lanes import Place, WeighedAt
+from heliograph.live.plant import Plant
+from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.senders import SenderStatus
 from heliograph.numerics.check import InputError, instance, shown
-from heliograph.serving.fleet import Finalised, Fleet
-from heliograph.serving.lanes import Lanes, Place, WeighedAt
+from heliograph.serving.exchange import Exchange
 from heliograph.serving.message import Message, Payload, read_message
 from heliograph.serving.output import Output
-from heliograph.serving.plant import Plant
-from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
@@ -117,6 +121,7 @@ class Service:
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = OutputWriter(fleet.lanes), Using(fleet, self.plants)
+        self._exchange = Exchange(fleet, self._moment)
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
@@ -213,6 +218,7 @@ class Service:
                 said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
                 entries.append(_refused(None, {}, "malformed", said))
                 continue
+            # Verdicts: used, known already, or refused with the reason.
             if plant is not None:
                 touched[plant.name] = plant
             if verdict == "used":
@@ -223,7 +229,8 @@ class Service:
             entries += [_refusal(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
-        # Step what is due; estimates of final rows are committed, provisional ones only published.
+        # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
+        sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
         entries += self._finals(finalised)
         provisional = self._provisional([item for item in finalised if item.plant.name in used])
@@ -233,7 +240,7 @@ class Service:
         committed = perf_counter() - begun
         self.malformed += malformed
         self.known += known
-        return outputs + provisional, committed
+        return outputs + sent + provisional, committed
 
     def _warn(self, message: Message, why: str) -> None:
         """Report the first implausible message, once."""
@@ -293,10 +300,13 @@ class Service:
         ]
 
     def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
-        unit = self.fleet.options.step or 1.0
-        moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
         senders = self.fleet.senders(plant) if kind == "provisional" else {}
-        return self._writer.estimates(kind, plant.name, moment, outputs, senders)
+        return self._writer.estimates(kind, plant.name, self._moment(plant, at), outputs, senders)
+
+    def _moment(self, plant: Plant, at: float) -> float | str:
+        """Return the time of a row as messages have it."""
+        unit = self.fleet.options.step or 1.0
+        return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
 
 
 @contextmanager

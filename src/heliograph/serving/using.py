@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.fleet import Fleet
+from heliograph.live.judging import Candidate, Judges
+from heliograph.live.plant import Link, Plant
 from heliograph.numerics.check import InputError
-from heliograph.serving.fleet import Fleet
-from heliograph.serving.judging import Candidate, Judges
 from heliograph.serving.message import Message, seconds
-from heliograph.serving.plant import Link, Plant
 
 
 class Outcome(NamedTuple):
@@ -64,6 +64,7 @@ class Using:
                 outcomes[i] = self._outcome(i, messages[i])
             self.fleet.step(list({item.plant.name: item.plant for item in self._taken}.values()))
             result = self._judges.implausible(self._taken)
+            # Plants that an implausible message has spoilt go back.
             spoilt = set()
             for i, why in result.items():
                 number, plant, event, _ = self._taken[i]

@@ -13,7 +13,7 @@ from scipy.special import gammaincinv
 
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
-from heliograph.live.player import TIME_STEP
+from heliograph.live.lanes import TIME_STEP
 from heliograph.model.estimate import Claim
 from heliograph.numerics.types import unit_of
 from heliograph.report.outputs import RecentOutputs, output_row
@@ -389,9 +389,9 @@ def watch_of(network: Network, title: str) -> Watch:
     """Return the observer of services of a network, whose name is `title`."""
     claims = network.claims()
     fused = {
-        name: (claims[FUSED][name], [(node, item.filter) for node in network.nodes_with(item.filter)])
-        for name, item in network.fused.items()
-        if isinstance(item, Fusion)
+        name: (claims[FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
+        for name, fusion in network.fused.items()
+        if isinstance(fusion, Fusion)
     }
     names: dict[tuple[str, str], Sequence[str]] = {
         (node, name): place.received_names for node, place in network.nodes.items() for name in place.filters

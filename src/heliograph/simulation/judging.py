@@ -20,21 +20,21 @@ Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 
-def implausible(result: Mapping[str, PyTree]) -> jax.Array:
+def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
     """Test whether some filter judges its measurement implausible."""
-    items = [jnp.any(item.implausible) for item in (*result["judged"], *result["judged_centrally"].values())]
+    items = [jnp.any(item.implausible) for item in (*outputs["judged"], *outputs["judged_centrally"].values())]
     return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
 
 
-def any_implausible(result: Mapping[str, PyTree]) -> bool:
+def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
     """Test the same of stored results."""
-    return any((item.reason > 0).any() for item in (*result["judged"], *result["judged_centrally"].values()))
+    return any((item.reason > 0).any() for item in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
-def reasons(result: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """Reason of each filter not to use its measurement, by kind and by name."""
-    return [item.reason for item in result["judged"]], {
-        n: item.reason for n, item in result["judged_centrally"].items()
+    return [item.reason for item in outputs["judged"]], {
+        n: item.reason for n, item in outputs["judged_centrally"].items()
     }
 
 
@@ -77,20 +77,20 @@ class Judges:
             if network.nodes[node].filters[name].received:
                 self._places[node].append(place)
 
-    def of_node(self, result: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
+    def of_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of the filters that receive from a node; where it has none, of the central ones."""
-        return self._rows(result, self._places[node], not self._places[node])
+        return self._rows(outputs, self._places[node], not self._places[node])
 
-    def of_all(self, result: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
+    def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of all filters."""
-        places = [(k, f, i) for k, item in enumerate(result["judged"]) for f, i in np.ndindex(*item[0].shape[-2:])]
-        return self._rows(result, places, True)
+        places = [(k, f, i) for k, item in enumerate(outputs["judged"]) for f, i in np.ndindex(*item[0].shape[-2:])]
+        return self._rows(outputs, places, True)
 
     def _rows(
-        self, result: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
+        self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        items = [[part[..., f, i] for part in result["judged"][k]] for k, f, i in places]
-        items += [list(item) for item in result["judged_centrally"].values()] if central else []
+        items = [[part[..., f, i] for part in outputs["judged"][k]] for k, f, i in places]
+        items += [list(item) for item in outputs["judged_centrally"].values()] if central else []
         if not items:
             return np.zeros((0, len(Judgement._fields)))
         return np.moveaxis(np.array(items), (0, 1), (-2, -1))
@@ -108,15 +108,15 @@ def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, d
     return result
 
 
-def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
+def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
     """Messages about a recording: rows that are implausible, or to one filter alone, and inputs."""
     # Rows that are implausible for all filters of a node.
     lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, item in refused.items()
              for rows, why in [(list(item), next(iter(item.values())))]]  # fmt: skip
     # Rows that a single filter skips.
-    items = {(node, name): [part[:, f, i] for part in result["judged"][kind]]
+    items = {(node, name): [part[:, f, i] for part in outputs["judged"][kind]]
             for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
-    every = {(FUSED, name): list(item) for name, item in result["judged_centrally"].items()}
+    every = {(FUSED, name): list(item) for name, item in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
     for (node, name), (distance, _, reason, _) in (items | every).items():
         known = all_rows if node == FUSED else refused.get(node, {})
@@ -126,7 +126,7 @@ def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str,
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
-        votes = Judges(network).of_all(result)
+        votes = Judges(network).of_all(outputs)
         rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
         lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines

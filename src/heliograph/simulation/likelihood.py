@@ -37,5 +37,5 @@ def log_likelihood(
 
 
 @compiled
-def _sum(item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    return jnp.sum(over_rows(item, z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
+def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+    return jnp.sum(over_rows(filter, z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))

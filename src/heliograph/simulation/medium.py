@@ -149,8 +149,8 @@ class SeparateChannels(AbstractMedium):
         return {str(g): reach.sender.last for g, reach in links if reach.sender is not None}
 
 
-def _first_mean(item: AbstractFilter) -> jax.Array:
-    return jnp.asarray(item.estimate(item.init()).mean)
+def _first_mean(filter: AbstractFilter) -> jax.Array:
+    return jnp.asarray(filter.estimate(filter.init()).mean)
 
 
 def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
@@ -310,9 +310,11 @@ def medium_of(network: Network) -> AbstractMedium:
         if names[0] not in nodes:
             groups.append(Silent(len(names)))
             continue
+        # Sensor, channel, and where their draws and memories stand.
         stacked = stack([(nodes[name].sensor, _unnamed(nodes[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         memory_rows = np.stack([memories[name] for name in names])
+        # What a sender that decides knows: its filter, its rule.
         informed_by = nodes[names[0]].informed_by or nodes[names[0]].predictor
         reference_filter: PyTree = (
             None if informed_by is None else stack([nodes[name].filters[informed_by] for name in names])

@@ -99,7 +99,9 @@ class Network(Module):
             name: SENSORLESS if node is None else node for name, node in table("nodes", nodes, "nodes").items()
         }
         fusions = {} if fused is None else table("fused", fused, "fusions and central filters")
-        self.meshes = {name: item for name, item in fusions.items() if isinstance(item, Fusion) and item.neighbours}
+        self.meshes = {
+            name: fusion for name, fusion in fusions.items() if isinstance(fusion, Fusion) and fusion.neighbours
+        }
         self.fused = {name: item for name, item in fusions.items() if name not in self.meshes}
         self.names = tuple(self.nodes)
         check_type("plant", first(plant), AbstractPlant)
@@ -108,7 +110,7 @@ class Network(Module):
         # Nodes and filters fit the plant; draws need names with distinct checksums.
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            if node != SENSORLESS:
+            if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
                 check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
             for label, element in node.filters.items():
                 check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)
@@ -138,16 +140,16 @@ class Network(Module):
             check_mesh(name, mesh, self)
 
     def _check_fused(self) -> None:
-        for name, item in self.fused.items():
-            if isinstance(item, Fusion):
-                item.check(self.nodes_with(item.filter), len(self.states))
-                self._fused_claim(item)
+        for name, fusion in self.fused.items():
+            if isinstance(fusion, Fusion):
+                fusion.check(self.nodes_with(fusion.filter), len(self.states))
+                self._fused_claim(fusion)
             else:
-                check_type(f"fused {name!r}", item, AbstractFilter)
-                check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
-                check_sizes(f"fused {name!r}", item, self.states, self.inputs)
+                check_type(f"fused {name!r}", fusion, AbstractFilter)
+                check_received(f"fused {name!r}", fusion, sum(node.received for node in self.nodes.values()))
+                check_sizes(f"fused {name!r}", fusion, self.states, self.inputs)
                 links = [first(node.channel) for node in self.nodes.values() if isinstance(node, Node)]
-                check_flags(f"fused {name!r}", item, links)
+                check_flags(f"fused {name!r}", fusion, links)
 
     @staticmethod
     def of_relays(
@@ -302,14 +304,14 @@ class Network(Module):
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
         claims = {
-            name: {f: claim_at(node, item) for f, item in node.filters.items()} for name, node in self.nodes.items()
+            name: {f: claim_at(node, filter) for f, filter in node.filters.items()} for name, node in self.nodes.items()
         }
         for name, mesh in self.meshes.items():
             claim = mesh_claim(name, mesh, self)
             for node in self.mesh_nodes(name):
                 claims[node][name] = claim
         if self.fused:
-            claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
+            claims[FUSED] = {name: self._fused_claim(fusion) for name, fusion in self.fused.items()}
             if any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values()):
                 claims[FUSED] = lowered(claims)[FUSED]
         return lowered(claims) if self.single else claims
@@ -320,27 +322,27 @@ class Network(Module):
         object.__setattr__(result, "single", True)
         return result
 
-    def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
-        if isinstance(item, AbstractFilter):
-            return item.claim
-        names = self.nodes_with(item.filter)
+    def _fused_claim(self, fusion: Fusion | AbstractFilter) -> Claim:
+        if isinstance(fusion, AbstractFilter):
+            return fusion.claim
+        names = self.nodes_with(fusion.filter)
         # A rule that needs nothing but the estimates.
-        if not isinstance(item.rule, AbstractInformedFusion):
-            return item.claim([claim_at(self.nodes[n], self.nodes[n].filters[item.filter]) for n in names])
-        rule, local = type(item.rule).__name__, {n: self.nodes[n] for n in names}
-        if item.quantizer is not None and not item.by_report:
+        if not isinstance(fusion.rule, AbstractInformedFusion):
+            return fusion.claim([claim_at(self.nodes[n], self.nodes[n].filters[fusion.filter]) for n in names])
+        rule, local = type(fusion.rule).__name__, {n: self.nodes[n] for n in names}
+        if fusion.quantizer is not None and not fusion.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
         # An informed rule: it needs the joint moments of the errors.
-        known = self.parts_of(item.filter)
+        known = self.parts_of(fusion.filter)
         if len(known) < len(local):
             raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
-        if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
+        if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
                        type(next(iter(known.values()))[2]).__name__)  # fmt: skip
         claim = informed_claim(rule, self.plant, known, self.common is not None)
-        if not item.by_report:
+        if not fusion.by_report:
             return claim
-        return reported_claim(rule, claim, item, {n: node.complete for n, node in local.items()})
+        return reported_claim(rule, claim, fusion, {n: node.complete for n, node in local.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Sensor, channel and the filter `name` of each node that has it and receives a sensor through a channel."""
@@ -366,9 +368,9 @@ def _world(node: Node | ReceivingNode) -> object:
     return node.received, node.complete
 
 
-def claim_at(node: Node | ReceivingNode, item: AbstractFilter) -> Claim:
+def claim_at(node: Node | ReceivingNode, filter: AbstractFilter) -> Claim:
     """Claim of a filter at a node."""
-    return node.claim_of(item) if isinstance(node, Node) else item.claim
+    return node.claim_of(filter) if isinstance(node, Node) else filter.claim
 
 
 def lowered(claims: Claims) -> Claims:

@@ -27,7 +27,7 @@ from heliograph.random_affine.modes import ModeOutput, OneStepLate
 NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
 
-def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
+def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRandomAffine]) -> None:
     """Refuse channels, one after another, whose flags are not those of the filter's model: its claim would be wrong.
 
     Raises:
@@ -35,10 +35,10 @@ def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRand
     """
     rows = [part for channel in channels for part in _rows(channel)]
     # Flags stand after the measurement; each comes from one row of the channels.
-    for reader in _readers(item):
+    for reader in _readers(filter):
         if isinstance(reader, ModeObservedFilter):
             sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
-            wrong = [part for part in rows[sent : reader.received] if not _reveals(part, reader.late)]
+            wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
         else:
             expected = "hg.model.with_flag(link, flags)"
             wrong = [part for part in rows[reader.received - 1 : reader.received] if isinstance(part, OneStepLate)]
@@ -48,22 +48,22 @@ def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRand
             raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
 
 
-def _readers(item: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
+def _readers(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Filters that use flags, after the measurement in the received vector; also inside of others."""
     kinds = SideInformationFilter, ModeObservedFilter
-    leaves = jax.tree.leaves(item, is_leaf=lambda part: isinstance(part, kinds))
+    leaves = jax.tree.leaves(filter, is_leaf=lambda part: isinstance(part, kinds))
     return [
-        part
-        for part in leaves
-        if isinstance(part, ModeObservedFilter) or (isinstance(part, SideInformationFilter) and part.flagged)
+        leaf
+        for leaf in leaves
+        if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged)
     ]
 
 
 def _rows(channel: AbstractRandomAffine) -> Iterator[AbstractRandomAffine]:
     """Yield for each output the map that it comes from."""
     if isinstance(channel, Stack):
-        for part in channel.maps:
-            yield from _rows(part)
+        for affine in channel.maps:
+            yield from _rows(affine)
     else:
         yield from [channel] * channel.outputs
 
@@ -125,7 +125,7 @@ class Node(Module):
         # Side information of the right step; feedback to one filter alone.
         for name, item in self.filters.items():
             check_flags(f"filter {name!r}", item, [first(channel)])
-        observation = [name for name, item in self.filters.items() if item.received]
+        observation = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and observation != [self.informed_by]:
             raise fail(
                 "node whose sensor has feedback",
@@ -144,20 +144,20 @@ class Node(Module):
         """Name of the filter whose prediction the sender compares with; None where it compares with none."""
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
-        return next(name for name, item in self.filters.items() if _predicts(item, self.trigger))
+        return next(name for name, filter in self.filters.items() if _predicts(filter, self.trigger))
 
-    def claim_of(self, item: AbstractFilter) -> Claim:
+    def claim_of(self, filter: AbstractFilter) -> Claim:
         """Claim of a filter here: without the trigger it does not know why something is missing."""
-        if self.trigger is None or isinstance(self.trigger, Periodic) or not item.received:
-            return item.claim
-        rule = getattr(item, "trigger", None)
+        if self.trigger is None or isinstance(self.trigger, Periodic) or not filter.received:
+            return filter.claim
+        rule = getattr(filter, "trigger", None)
         knows = alike(rule, self.trigger) and bool(eqx.tree_equal(rule, self.trigger))
-        return item.claim if knows else lowered_claim(item.claim)
+        return filter.claim if knows else lowered_claim(filter.claim)
 
     @property
     def informed_by(self) -> str | None:
         """Name of the filter whose estimates are fed back to the sensor; None without."""
-        return next((name for name, item in self.filters.items() if isinstance(item, FedBackFilter)), None)
+        return next((name for name, filter in self.filters.items() if isinstance(filter, FedBackFilter)), None)
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -205,8 +205,8 @@ class Common(Module):
     channel: Channel
 
 
-def _predicts(item: AbstractFilter, trigger: AbstractTrigger) -> bool:
-    return isinstance(item, EventFilter | StochasticEventFilter) and item.trigger.reference == "prediction"
+def _predicts(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
+    return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
 
 
 def lowered_claim(claim: Claim) -> Claim:
@@ -235,7 +235,7 @@ def check_trigger(
     if trigger.region == "each" and channel.outputs != len(sensor.outputs):
         raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
     # A sender that compares with a prediction knows one filter.
-    if any(isinstance(item, FedBackFilter) for item in filters.values()):
+    if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(
         isinstance(item, AbstractFilter) and _predicts(item, trigger) for item in filters.values()
@@ -248,28 +248,30 @@ def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
     return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 
 
-def check_received(name: str, item: AbstractFilter, received: int) -> None:
+def check_received(name: str, filter: AbstractFilter, received: int) -> None:
     """Refuse a filter of another number of components than arrive, unless it uses no measurements."""
-    if item.received not in (0, received):  # 0: it uses no measurements
-        raise fail(name, f"one that receives the {received} numbers that arrive", f"one that receives {item.received}")
+    if filter.received not in (0, received):  # 0: it uses no measurements
+        raise fail(
+            name, f"one that receives the {received} numbers that arrive", f"one that receives {filter.received}"
+        )
 
 
-def check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+def check_sizes(name: str, filter: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
     """Refuse a filter of other numbers of states and inputs than the plant has."""
-    for what, single, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
+    for what, single, theirs in (("states", states, filter.states), ("inputs", inputs, filter.inputs)):
         if len(single) != len(theirs):
             raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
     """Refuse filters that do not fit the measurement of their node."""
-    for name, item in filters.items():
-        check_type(f"filter {name!r}", item, AbstractFilter)
-        if isinstance(item, AbstractFilter):
-            check_received(f"filter {name!r}", item, received)
+    for name, filter in filters.items():
+        check_type(f"filter {name!r}", filter, AbstractFilter)
+        if isinstance(filter, AbstractFilter):
+            check_received(f"filter {name!r}", filter, received)
 
 
 def check_type(name: str, value: object, expected: type) -> None:
     """Refuse an object of another class, in one line."""
     if not isinstance(value, expected):
-        raise fail(name, f"a {expected.__name__}", shown(value))
+        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", shown(value))

@@ -18,7 +18,7 @@ from heliograph.simulation.judging import any_implausible, doubts, forbidden_row
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
-from heliograph.simulation.smoothed import Smoother, found_record, smoothed_part, with_truth
+from heliograph.simulation.smoothed import Smoother, record_of, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters, begun
 from heliograph.smoothing.modes import AbstractSmoothing
 
@@ -68,7 +68,9 @@ def run(
     """
     check_process()
     instance("network", network, Network, "a Network")
-    network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
+    name = next(iter(network.nodes))
+    measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
+    network = network.restricted_to(measured)
     steps = len(np.asarray(next(iter(measurements.values()))))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -101,7 +103,7 @@ def run(
             for name, mesh in filters.meshes.items()
         }
         outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
-    record = found_record(network, smoothing, outputs, clock)
+    record = record_of(network, smoothing, outputs, clock)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 

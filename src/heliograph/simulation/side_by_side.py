@@ -36,7 +36,7 @@ class StepOutput(NamedTuple):
 
 
 def filter_step(
-    item: AbstractFilter,
+    filter: AbstractFilter,
     state: PyTree,
     z: jax.Array,
     u: jax.Array,
@@ -53,17 +53,17 @@ def filter_step(
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
     # With a smoother step, a judgement, or neither.
     if smooths:
-        judgement = item.step_judged(state, z, u, k)[2] if judges else None
-        after, steps = item.step_with_smoother(state, z, u, k)
-        return after, StepOutput(item.after_step(after, k), steps, judgement)
+        judgement = filter.step_judged(state, z, u, k)[2] if judges else None
+        after, steps = filter.step_with_smoother(state, z, u, k)
+        return after, StepOutput(filter.after_step(after, k), steps, judgement)
     judgement, weighed = None, None
     if judges:
-        after, estimate, judgement, innovation = step_with_judgement(item, state, z, u, k)
+        after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
         weighed = weighed_in(innovation)
     else:
-        after, estimate = item.step(state, z, u, k)
+        after, estimate = filter.step(state, z, u, k)
     if skip is not None:
-        stays, known = skip == Reason.PREDICTION, (state, item.estimate(state))
+        stays, known = skip == Reason.PREDICTION, (state, filter.estimate(state))
         after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
     return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
 
@@ -102,9 +102,9 @@ class Alike(Module):
         """
 
         def single(
-            item: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
+            filter: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
         ) -> tuple[PyTree, StepOutput]:
-            return filter_step(item, state, z, u, k, self.smooths, self.judges, skip)
+            return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
         both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0)))
@@ -121,9 +121,9 @@ class Alike(Module):
         return items(filters, states, z)
 
 
-def started(item: AbstractFilter) -> PyTree:
+def started(filter: AbstractFilter) -> PyTree:
     """State of a filter before the first step, on the device."""
-    return jax.tree.map(jnp.asarray, item.init())
+    return jax.tree.map(jnp.asarray, filter.init())
 
 
 def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:

@@ -54,8 +54,8 @@ class Smoother(Module):
         sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
         estimates = tuple(sweep(steps) for steps in steps_by_kind)
         fused = {name: self.smoothing.sweep(steps) for name, steps in result["central_steps"].items()}
-        for item in self.fusions:
-            fused |= _combined(item, estimates)
+        for fusion in self.fusions:
+            fused |= _combined(fusion, estimates)
         # As of the steps that are smoothed.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
@@ -87,9 +87,9 @@ class Smoother(Module):
         return {"estimates": estimates, "fused": {name: near(item, every) for name, item in known["fused"].items()}}
 
 
-def _combined(item: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
+def _combined(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
     """Fuse estimates (time, filter, node, ...) at each time."""
-    result: dict[str, Estimate] = jax.vmap(lambda parts: item.step((), parts, jnp.asarray(0))[1])(estimates)
+    result: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
     return result
 
 
@@ -137,33 +137,33 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
         part = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
-        name: {f: _smoothed_claim(item) for f, item in node.filters.items()} for name, node in part.nodes.items()
+        name: {f: _smoothed_claim(filter) for f, filter in node.filters.items()} for name, node in part.nodes.items()
     }
     if part.fused:
-        claims[FUSED] = {name: _fused_claim(part, name, item, claims) for name, item in part.fused.items()}
+        claims[FUSED] = {name: _fused_claim(part, name, fusion, claims) for name, fusion in part.fused.items()}
     groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(part.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
     return Part(part, smoothing, kinds, groups, claims)
 
 
-def _smoothed_claim(item: AbstractFilter) -> Claim:
-    u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
+def _smoothed_claim(filter: AbstractFilter) -> Claim:
+    u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
-        state = jax.tree.map(jnp.asarray, item.init())
-        _, step = eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), item, state)
+        state = jax.tree.map(jnp.asarray, filter.init())
+        _, step = eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
     claim: Claim = step.claim
     return claim
 
 
-def _fused_claim(network: Network, name: str, item: Fusion | AbstractFilter, claims: Claims) -> Claim:
-    if isinstance(item, AbstractFilter):
-        return _smoothed_claim(item)
-    if isinstance(item.rule, AbstractInformedFusion):
-        got = f"{type(item.rule).__name__}, which knows errors as they are before later data"
+def _fused_claim(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
+    if isinstance(fusion, AbstractFilter):
+        return _smoothed_claim(fusion)
+    if isinstance(fusion.rule, AbstractInformedFusion):
+        got = f"{type(fusion.rule).__name__}, which knows errors as they are before later data"
         raise fail(f"smoothing of {FUSED}/{name}", "a rule that needs no joint covariance", got)
-    if item.quantizer is not None:
+    if fusion.quantizer is not None:
         raise fail(f"smoothing of {FUSED}/{name}", "estimates that arrive as they are", "a quantizer")
-    return item.claim([claims[node][item.filter] for node in network.nodes_with(item.filter)])
+    return fusion.claim([claims[node][fusion.filter] for node in network.nodes_with(fusion.filter)])
 
 
 def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
@@ -176,7 +176,7 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_of(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def found_record(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
+def record_of(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
     """Record of a recording, with its smoothed part."""
     if part is None:
         return trajectories_record(network, {"truth": None, **result}, time)
@@ -201,7 +201,8 @@ def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Ab
             later, plant, np.broadcast_to(smoothing.about(truth), (len(later.time), truth.shape[1])), None
         )
     estimates = {
-        node: {name: near(item, truth) for name, item in filters.items()} for node, filters in record.estimates.items()
+        node: {name: near(filter, truth) for name, filter in filters.items()}
+        for node, filters in record.estimates.items()
     }
     return replace(record, truth=truth, estimates=estimates, smoothed=later)
 

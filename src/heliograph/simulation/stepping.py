@@ -83,7 +83,7 @@ class AllFilters(Module):
             for kind, (g, names) in enumerate(network.kinds)
         )
         # Central filters, fusions, informed centres, centres with reports.
-        self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
+        self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = fusions_of(network), centres_of(network)
         self.reporting, self.meshes = _reporting(network), meshes_of(network)
         self.tests = fused_innovations(network, self.alike) if tests else {}
@@ -99,11 +99,11 @@ class AllFilters(Module):
         """Return states before the first step: of filters, central ones, quantizers, centres, reports, tests."""
         central = {name: started(item) for name, item in self.central.items()}
         local = tuple(item.init() for item in self.alike)
-        sent = tuple(item.init(self.n) for item in self.fusions)
+        sent = tuple(fusion.init(self.n) for fusion in self.fusions)
         reporting: dict[str, PyTree] = {name: item.init() for name, item in self.reporting.items()}
-        reporting |= {name: item.init() for name, item in self.meshes.items()}
-        tested = {name: item.start for name, item in self.tests.items()}
-        return local, central, sent, tuple(self._started(item, local) for item in self.centres), reporting, tested
+        reporting |= {name: mesh.init() for name, mesh in self.meshes.items()}
+        tested = {name: test.start for name, test in self.tests.items()}
+        return local, central, sent, tuple(self._started(centre, local) for centre in self.centres), reporting, tested
 
     def _started(self, centre: Centre | LinearisedCentre, local: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
         means = [local[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
@@ -183,16 +183,14 @@ class AllFilters(Module):
             uplinks |= {name: traffic} if traffic else {}
         # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
         for name, mesh in sorted(self.meshes.items()):
-            happens = mesh.edges.lossless() if drawn is None else drawn[name]
+            happens = mesh.edges.lossless() if drawn is None else drawn[name]  # within a process nothing is lost
             flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
-            if drawn is None and mesh.edges.groups:
-                raise fail(f"fusion {name!r} between neighbours", "which messages arrived", "none of it")
             published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
             estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
         # Tests of fused estimates, by what arrived after the last of them.
         distances = {
-            name: item.step(tested[name], self.alike, filter_states, z, u, k, reasons)
-            for name, item in self.tests.items()
+            name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
+            for name, test in self.tests.items()
         }
         tested = {name: following_prior(fused[name]) for name in self.tests}
         # Next states and results.
@@ -253,8 +251,8 @@ def _plan(
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
     """Plan these filters alone: it is one program, whatever a network's fusions are."""
 
-    def single(item: AbstractFilter, smooths: bool) -> AbstractFilter:
-        return planned_with_past(item, u) if smooths else item.planned(u)
+    def single(filter: AbstractFilter, smooths: bool) -> AbstractFilter:
+        return planned_with_past(filter, u) if smooths else filter.planned(u)
 
     planned = tuple(
         replace(item, filters=over_all(partial(single, smooths=item.smooths), item.count * item.nodes)(item.filters))
@@ -274,12 +272,12 @@ def plans(filters: AllFilters) -> bool:
 def _reporting(network: Network) -> dict[str, Reporting]:
     """Fusions by reports, each with its uplinks and its centre."""
     results = {}
-    for name, item in network.fused.items():
-        if isinstance(item, Fusion) and item.by_report:
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and fusion.by_report:
             centre = centre_filter(network, name)
-            places, mine = network.places(), network.nodes_with(item.filter)
-            sources, order = gathering(network, places, mine, item.filter)
-            uplinks = uplinks_of(item, mine, len(network.states))
+            places, mine = network.places(), network.nodes_with(fusion.filter)
+            sources, order = gathering(network, places, mine, fusion.filter)
+            uplinks = uplinks_of(fusion, mine, len(network.states))
             results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
     return results
 
@@ -327,7 +325,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
 def _with_only(node: Node | ReceivingNode, name: str) -> Node | ReceivingNode:
     """Return a node with one of its filters."""
-    filters = {single: item for single, item in node.filters.items() if single == name}
+    filters = {single: filter for single, filter in node.filters.items() if single == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)
     return replace(node, filters=filters)

@@ -46,29 +46,29 @@ def smoother_steps(
 
 @compiled
 def stepped(
-    item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
+    filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
 ) -> tuple[PyTree, AbstractSmootherStep]:
     """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractSmootherStep]:
-        return item.step_with_smoother(state, *row)
+        return filter.step_with_smoother(state, *row)
 
     rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
 
 
-def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
+def planned_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     """Plan the filter for these inputs and complete data, with its smoother steps but for their data."""
-    planned = item.planned(inputs)
-    if planned is item:
-        return item
-    return planned.with_past(quiet_steps(item, inputs))
+    planned = filter.planned(inputs)
+    if planned is filter:
+        return filter
+    return planned.with_past(quiet_steps(filter, inputs))
 
 
-def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractSmootherStep:
+def quiet_steps(filter: AbstractFilter, inputs: Array) -> AbstractSmootherStep:
     """Smoother steps for measurements of zero: right but for means, if no gain depends on data."""
-    quiet = jnp.zeros((len(inputs), item.received))
-    steps: AbstractSmootherStep = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
+    quiet = jnp.zeros((len(inputs), filter.received))
+    steps: AbstractSmootherStep = stepped(filter, quiet, inputs, filter.init(), np.asarray(0))[1]
     return steps
 
 
@@ -144,6 +144,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
         )
         return both
 
+    # As many steps back as the lag has.
     _, outcome = jax.lax.fori_loop(0, lag, body, start)
     result: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
     return result

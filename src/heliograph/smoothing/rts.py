@@ -116,11 +116,11 @@ def planned_smoother(
 
 
 @compiled
-def _planned(item: AbstractFilter, u: Array) -> AbstractFilter | None:
-    planned = planned_with_past(item, u)
-    return None if planned is item else planned
+def _planned(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
+    planned = planned_with_past(filter, u)
+    return None if planned is filter else planned
 
 
 @compiled
-def _estimate(item: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    return smoothing.sweep(quiet_steps(item, u))
+def _estimate(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
+    return smoothing.sweep(quiet_steps(filter, u))

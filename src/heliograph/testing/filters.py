@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import STRENGTH, Estimate, Innovation
-from heliograph.numerics.check import own_units
+from heliograph.numerics.check import standard_deviations
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.likelihood import log_likelihood
@@ -117,7 +117,7 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
         assert np.all(np.isnan(bound)), f"step {k}: expected a covariance of NaN, since none is claimed"
         return
     assert np.all(np.isfinite(bound)), f"step {k}: expected a finite covariance"
-    unit = own_units(bound)
+    unit = standard_deviations(bound)
     correlations = bound / np.outer(unit, unit)
     assert np.abs(correlations - correlations.T).max() <= ROUNDING, f"step {k}: expected a symmetric covariance"
     smallest = np.linalg.eigvalsh((correlations + correlations.T) / 2)[0]

@@ -14,18 +14,18 @@ ROUNDING = 1e-9  # relative, of quantities that are worked out in a few steps
 LONG = 100  # steps of the strong scenario
 
 
-def errata(result: Outcome) -> list[Statement]:
+def errata(outcome: Outcome) -> list[Statement]:
     """Every erratum: the statement is that the formula is right as printed."""
-    s = result.printed.scenario
+    s = outcome.printed.scenario
     return [
-        _sign(result), _raw_minus(), _cross(result), _one_symbol(result), _raw_everywhere(result), _root(result),
-        _fusion(result), _relay_energy(s), _process_noise(result), _offset(result), _prediction(s),
-        _uncertainty(result), _whiteness(), _units(result), _horizon(s),
+        _sign(outcome), _raw_minus(), _cross(outcome), _one_symbol(outcome), _raw_everywhere(outcome), _root(outcome),
+        _fusion(outcome), _relay_energy(s), _process_noise(outcome), _offset(outcome), _prediction(s),
+        _uncertainty(outcome), _whiteness(), _units(outcome), _horizon(s),
     ]  # fmt: skip
 
 
-def _scenarios(result: Outcome) -> list[Scenario]:
-    return [o.scenario for o in result.both]
+def _scenarios(outcome: Outcome) -> list[Scenario]:
+    return [o.scenario for o in outcome.both]
 
 
 def rmse(outcome: Runs, name: str) -> str:
@@ -51,10 +51,10 @@ def change(outcome: Runs, name: str, reference: str) -> float:
     return 100 * (outcome.pooled(name).rmse()[0] / outcome.pooled(reference).rmse()[0] - 1)
 
 
-def _sign(result: Outcome) -> Statement:
-    terms = [[one_step.box_terms(one_step.channel_of(s), sign).V for sign in (1, -1)] for s in _scenarios(result)]
-    excess = [100 * one_step.perfect_channel_excess(s) for s in _scenarios(result)]
-    strong, printed = result.strong, result.printed
+def _sign(outcome: Outcome) -> Statement:
+    terms = [[one_step.box_terms(one_step.channel_of(s), sign).V for sign in (1, -1)] for s in _scenarios(outcome)]
+    excess = [100 * one_step.perfect_channel_excess(s) for s in _scenarios(outcome)]
+    strong, printed = outcome.strong, outcome.printed
     traces = [strong.pooled(name).mean_trace() for name in ("cubature_printed", "cubature_tight")]
     loose, tight = (printed.pooled(f"cubature_{name}_fixed").mean_trace() for name in ("printed", "tight"))
     ours = (
@@ -87,10 +87,10 @@ def _raw_minus() -> Statement:
     )  # fmt: skip
 
 
-def _cross(result: Outcome) -> Statement:
-    right = one_step.innovation(result.printed.scenario, hg.filters.Cubature()).Pxy
-    error = 100 * np.max(np.abs(one_step.mixed_cross(result.printed.scenario) - right)) / np.max(np.abs(right))
-    strong = result.strong
+def _cross(outcome: Outcome) -> Statement:
+    right = one_step.innovation(outcome.printed.scenario, hg.filters.Cubature()).Pxy
+    error = 100 * np.max(np.abs(one_step.mixed_cross(outcome.printed.scenario) - right)) / np.max(np.abs(right))
+    strong = outcome.strong
     ours = (
         f"Not P⁻C′: {error:.0f} % of its largest entry off at Ξ = 1.25 I. As a filter (polytope bound, strong): actual "
         f"over claimed covariance {ratio(strong, 'mixed_cross')}, RMSE {rmse(strong, 'mixed_cross')} against "
@@ -103,8 +103,8 @@ def _cross(result: Outcome) -> Statement:
     )  # fmt: skip
 
 
-def _one_symbol(result: Outcome) -> Statement:
-    strong, first = result.strong, one_step.innovation(result.printed.scenario, hg.filters.Cubature())
+def _one_symbol(outcome: Outcome) -> Statement:
+    strong, first = outcome.strong, one_step.innovation(outcome.printed.scenario, hg.filters.Cubature())
     ours = (
         "Y = E[yy′] belongs to the terms of the gains, the covariance of the innovation to the (1 + β₂) term. With "
         f"the covariance everywhere (polytope bound, strong): actual over claimed {ratio(strong, 'central_moment')}, "
@@ -117,8 +117,8 @@ def _one_symbol(result: Outcome) -> Statement:
     )  # fmt: skip
 
 
-def _raw_everywhere(result: Outcome) -> Statement:
-    strong = result.strong
+def _raw_everywhere(outcome: Outcome) -> Statement:
+    strong = outcome.strong
     traces = [strong.pooled(name).mean_trace() for name in ("raw_moment", "cubature_polytope_fixed")]
     ours = (
         f"Looser, no less valid: strong, mean trace {traces[0]:.5f} against {traces[1]:.5f}, RMSE "
@@ -131,9 +131,9 @@ def _raw_everywhere(result: Outcome) -> Statement:
     )  # fmt: skip
 
 
-def _root(result: Outcome) -> Statement:
-    factors = [s.mean_gain**-0.5 for s in _scenarios(result)]
-    changes = [change(o, "step_four_gain", "cubature_printed_fixed") for o in result.both]
+def _root(outcome: Outcome) -> Statement:
+    factors = [s.mean_gain**-0.5 for s in _scenarios(outcome)]
+    changes = [change(o, "step_four_gain", "cubature_printed_fixed") for o in outcome.both]
     ours = (
         f"Theorem 2 has μ, Step 4 √μ: the gain is {factors[0]:.2f} (printed) and {factors[1]:.2f} (strong) times too "
         f"large and (31) no longer belongs to it. RMSE {changes[0]:+.1f} % (printed), {changes[1]:+.1f} % (strong)"
@@ -145,8 +145,8 @@ def _root(result: Outcome) -> Statement:
     )  # fmt: skip
 
 
-def _fusion(result: Outcome) -> Statement:
-    local = [result.printed.shown.estimates[node]["cubature_printed_fixed"] for node in NODES]
+def _fusion(outcome: Outcome) -> Statement:
+    local = [outcome.printed.shown.estimates[node]["cubature_printed_fixed"] for node in NODES]
     means, bounds = (np.stack([np.asarray(getattr(e, a))[0] for e in local], axis=1) for a in ("mean", "covariance"))
     error = one_step.printed_fusion_error(means, bounds)
     ours = f"ΞΣw Ξᵢ⁻¹x̂ᵢ, as in (8); the printed inverse is off by up to {error:.1e} in a run of the printed example"
@@ -169,9 +169,9 @@ def _relay_energy(s: Scenario) -> Statement:
     )  # fmt: skip
 
 
-def _process_noise(result: Outcome) -> Statement:
-    claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()[9]
-    gap = one_step.predicted(result.printed.scenario, hg.filters.Linearization(), claimed)[1]
+def _process_noise(outcome: Outcome) -> Statement:
+    claimed = outcome.printed.statistics["1"]["cubature_printed_fixed"].claimed()[9]
+    gap = one_step.predicted(outcome.printed.scenario, hg.filters.Linearization(), claimed)[1]
     ours = (
         f"The cross terms are E[Φeω′] = 0; with e e′ as printed they would double ΦΞΦ′, {np.trace(gap):.2f} of trace "
         "at s = 10 (printed example)"
@@ -183,12 +183,12 @@ def _process_noise(result: Outcome) -> Statement:
     )  # fmt: skip
 
 
-def _offset(result: Outcome) -> Statement:
-    claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()
+def _offset(outcome: Outcome) -> Statement:
+    claimed = outcome.printed.statistics["1"]["cubature_printed_fixed"].claimed()
     gaps = []
     for rule in (hg.filters.Cubature(), hg.filters.PolynomialMoments(2)):
         moved, straight = (
-            np.array([one_step.predicted(result.printed.scenario, item, c)[0] for c in claimed])
+            np.array([one_step.predicted(outcome.printed.scenario, item, c)[0] for c in claimed])
             for item in (rule, hg.filters.Linearization())
         )
         gaps.append(moved - straight)
@@ -221,8 +221,8 @@ def _prediction(s: Scenario) -> Statement:
     )  # fmt: skip
 
 
-def _uncertainty(result: Outcome) -> Statement:
-    delta = np.random.default_rng(result.seed).uniform(-0.01, 0.01, (DRAWS, 3))
+def _uncertainty(outcome: Outcome) -> Statement:
+    delta = np.random.default_rng(outcome.seed).uniform(-0.01, 0.01, (DRAWS, 3))
     misses = np.abs(delta.sum(axis=1))
     miss = misses.mean()
     marginal = np.max(np.abs(delta.mean(axis=0)))
@@ -248,8 +248,8 @@ def _whiteness() -> Statement:
     )  # fmt: skip
 
 
-def _units(result: Outcome) -> Statement:
-    o = result.printed
+def _units(outcome: Outcome) -> Statement:
+    o = outcome.printed
     trace, error = o.claimed_trace("cubature_printed_fixed"), o.rmse("cubature_printed_fixed")
     ours = (
         f"An RMSE compares with √trace. Mean over nodes and steps: RMSE {error.mean():.3f}, √trace "

@@ -24,9 +24,9 @@ LITERAL = ("step_four_gain", "mixed_cross", "central_moment", "raw_moment")
 NODE_COLOURS = (BLUE, AMBER, GREEN, PURPLE)
 
 
-def figures(result: Outcome) -> dict[str, Figure]:
+def figures(outcome: Outcome) -> dict[str, Figure]:
     """All figures by file name."""
-    printed, drawn = result.printed, {}
+    printed, drawn = outcome.printed, {}
     for i, state in enumerate(STATES):
         drawn[f"fig{i + 1:02d}_{state}"] = _states(printed, i)
     drawn["fig06_trace"] = _traces(printed)
@@ -34,8 +34,8 @@ def figures(result: Outcome) -> dict[str, Figure]:
     for i, node in enumerate(NODES):
         drawn[f"fig{i + 8:02d}_node{node}"] = _against_extended(printed, i)
     drawn["fig12_fusion"] = _fusion(printed)
-    drawn["strong_filters"] = _strong_filters(result.strong)
-    drawn["strong_fusion"] = _strong_fusion(result.strong)
+    drawn["strong_filters"] = _strong_filters(outcome.strong)
+    drawn["strong_fusion"] = _strong_fusion(outcome.strong)
     return drawn
 
 
@@ -119,17 +119,17 @@ def _from_zero(o: Runs, text: str, curves: list[Curve]) -> Figure:
     return figure
 
 
-def words(result: Outcome) -> dict[str, object]:
+def words(outcome: Outcome) -> dict[str, object]:
     """Labels and colours, and the numbers of the tables: of a filter RMSE, its error, trace, and worst direction."""
-    strong = result.strong
+    strong = outcome.strong
     return {
         "label": label,
-        "named": {name: NAMES.get(name, name.replace("_", " ")) for o in result.both for name in _names(o)},
+        "named": {name: NAMES.get(name, name.replace("_", " ")) for o in outcome.both for name in _names(o)},
         "colours": COLOURS,
         "rmse": {name: strong.pooled(name).rmse() for name in (*BETTER, METHOD, "mean_gain")},
         "method": METHOD,
         "better": BETTER,
-        "tables": {"strong scenario": _table(strong), "printed example": _table(result.printed)},
+        "tables": {"strong scenario": _table(strong), "printed example": _table(outcome.printed)},
         "nodes": NODES,
         "states": STATES,
         "zero_mean_scalar": FIXED_ZERO_MEAN_SCALAR,

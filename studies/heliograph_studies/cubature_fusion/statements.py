@@ -18,18 +18,18 @@ BETTER = ("cubature_polytope", "cubature_zero_mean", "ci_equal")  # than the pap
 LITTLE = 1.05  # an error that is no larger without measurements, but for this factor
 
 
-def statements(result: Outcome) -> dict[str, list[Statement]]:
+def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """All statements: the paper's theorems and figures, what else was found, then the errata."""
     return {
-        "paper": [*theorems(result), *figures(result.printed)],
-        "found": [*findings(result), *better(result.strong)],
-        "errata": errata(result),
+        "paper": [*theorems(outcome), *figures(outcome.printed)],
+        "found": [*findings(outcome), *better(outcome.strong)],
+        "errata": errata(outcome),
     }
 
 
-def theorems(result: Outcome) -> list[Statement]:
+def theorems(outcome: Outcome) -> list[Statement]:
     """Theorems 1 to 3."""
-    violations, margin = one_step.enumerate_theorem_1(TRIALS, result.seed, 1)
+    violations, margin = one_step.enumerate_theorem_1(TRIALS, outcome.seed, 1)
     ours = (
         f"{violations} violations in {TRIALS} random joint laws, channel laws at the ends of their intervals, and "
         f"gains; least relative margin {margin:.1e}. It takes the true P⁻, P^xy and E[yy′]"
@@ -37,23 +37,23 @@ def theorems(result: Outcome) -> list[Statement]:
     return [
         Statement("(10) is an upper bound of the error covariance", f"{THEOREM}, Theorem 1", "one step", ours,
                   {"violations": violations}, lambda violations: holds(violations == 0)),
-        _whole_filter(result),
-        _gain(result.printed.scenario),
-        _boundedness(result.printed),
+        _whole_filter(outcome),
+        _gain(outcome.printed.scenario),
+        _boundedness(outcome.printed),
     ]  # fmt: skip
 
 
-def _whole_filter(result: Outcome) -> Statement:
-    exact = [ratio(o, "exact_moments_printed_fixed") for o in result.both]
+def _whole_filter(outcome: Outcome) -> Statement:
+    exact = [ratio(o, "exact_moments_printed_fixed") for o in outcome.both]
     ours = (
-        f"Actual over claimed in the worst direction: {ratio(result.printed, METHOD)} printed, "
-        f"{ratio(result.strong, METHOD)} strong. It is the prediction that is too small. Exact moments repair the "
+        f"Actual over claimed in the worst direction: {ratio(outcome.printed, METHOD)} printed, "
+        f"{ratio(outcome.strong, METHOD)} strong. It is the prediction that is too small. Exact moments repair the "
         f"printed example, {exact[0]}, and not quite the strong one, {exact[1]}: the error is not Gaussian, as they "
         "take it to be"
     )
     return Statement("The filter's Ξ is an upper bound, in every direction", f"{THEOREM}, Theorem 1 with Algorithm 1",
                      "“minimum upper bound”", ours,
-                     {"printed": worst(result.printed, METHOD), "strong": worst(result.strong, METHOD)},
+                     {"printed": worst(outcome.printed, METHOD), "strong": worst(outcome.strong, METHOD)},
                      lambda printed, strong: holds(printed.at_most(1) and strong.at_most(1)))  # fmt: skip
 
 
@@ -180,9 +180,9 @@ def _precision(o: Runs) -> Statement:
                      lambda least_gain_of_a_node: holds(least_gain_of_a_node > 0))  # fmt: skip
 
 
-def findings(result: Outcome) -> list[Statement]:
+def findings(outcome: Outcome) -> list[Statement]:
     """What was found about the bounds and the fusion."""
-    strong, early = result.strong, result.early
+    strong, early = outcome.strong, outcome.early
     return [
         _is_bound(strong, "mean_gain", "A filter that takes the mean gain for the true one knows its error"),
         _is_bound(strong, "cubature_polytope", "The polytope bound is one"),

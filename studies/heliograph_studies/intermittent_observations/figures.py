@@ -10,14 +10,14 @@ from heliograph_studies.intermittent_observations.compute import Outcome
 BURST_COLOURS = (GREEN, BLUE, AMBER)
 
 
-def figures(result: Outcome) -> dict[str, Figure]:
+def figures(outcome: Outcome) -> dict[str, Figure]:
     """Figures by file name."""
     return {
-        "scalar": _over_arrival(result, "scalar"),
-        "coupled": _over_arrival(result, "coupled"),
-        "bursts": _bursts(result),
-        "patterns": _patterns(result),
-        "rounding": _rounding(result),
+        "scalar": _over_arrival(outcome, "scalar"),
+        "coupled": _over_arrival(outcome, "coupled"),
+        "bursts": _bursts(outcome),
+        "patterns": _patterns(outcome),
+        "rounding": _rounding(outcome),
     }
 
 
@@ -33,31 +33,31 @@ def _over_arrival(result: Outcome, name: str) -> Figure:
     return curves_over(outcome.arrival, Panel(label, curves), "arrival probability", marks)
 
 
-def _bursts(result: Outcome) -> Figure:
+def _bursts(outcome: Outcome) -> Figure:
     curves = [
         Curve(f"begin: {fail:g}", colour, curve.mean)
-        for (fail, curve), colour in zip(result.burst_curves.items(), BURST_COLOURS, strict=True)
+        for (fail, curve), colour in zip(outcome.burst_curves.items(), BURST_COLOURS, strict=True)
     ]
-    threshold = max(result.recovery.values())
-    recover = next(iter(result.burst_curves.values())).recover
+    threshold = max(outcome.recovery.values())
+    recover = next(iter(outcome.burst_curves.values())).recover
     return curves_over(
         recover, Panel("mean of P", curves), "probability that losses end", {f"{threshold:.3f}": threshold}
     )
 
 
-def _patterns(result: Outcome) -> Figure:
-    low, between = result.critical["scalar"].lower - 0.06, result.setting.between
+def _patterns(outcome: Outcome) -> Figure:
+    low, between = outcome.critical["scalar"].lower - 0.06, outcome.setting.between
     curves = []
-    for arrival, colour, values in ((between, BLUE, result.between), (low, VERMILION, result.below)):
+    for arrival, colour, values in ((between, BLUE, outcome.between), (low, VERMILION, outcome.below)):
         increments = np.diff(values)
         curves.append(Curve(f"arrival {arrival:.2f}", colour, increments[1:] / increments[:-1]))
-    steps = np.arange(2, len(result.between))
-    curves.append(Curve(f"bound at {between:.2f}", MUTED, np.full(len(steps), result.between_bound)))
+    steps = np.arange(2, len(outcome.between))
+    curves.append(Curve(f"bound at {between:.2f}", MUTED, np.full(len(steps), outcome.between_bound)))
     return curves_over_time(steps, [Panel("increment over the last one", curves)])
 
 
-def _rounding(result: Outcome) -> Figure:
-    it = result.iterated
+def _rounding(outcome: Outcome) -> Figure:
+    it = outcome.iterated
     curves = [
         Curve("as printed, skew part", VERMILION, np.where(it.skew > 0, it.skew, np.nan)),
         Curve("as squares, tr V", BLUE, it.joseph),
@@ -66,8 +66,8 @@ def _rounding(result: Outcome) -> Figure:
     return curves_over(steps, Panel("skew part of V, and tr V", curves), "step")
 
 
-def words(result: Outcome) -> dict[str, object]:
+def words(outcome: Outcome) -> dict[str, object]:
     """The rows of the table: each plant and link."""
-    rows = {"scalar": result.scalar, "two states": result.coupled, "three states, one unstable": result.one_unstable}
-    rows |= {f"scalar, fail {link.fail:g}, recover {link.recover:g}": link for link in result.bursts}
+    rows = {"scalar": outcome.scalar, "two states": outcome.coupled, "three states, one unstable": outcome.one_unstable}
+    rows |= {f"scalar, fail {link.fail:g}, recover {link.recover:g}": link for link in outcome.bursts}
     return {"rows": rows, "blue": BLUE, "vermilion": VERMILION, "green": GREEN}

@@ -16,10 +16,10 @@ DIVERGED = 1e6  # of a covariance that starts near 1, after 100 steps
 MEASURE = 1e-9  # relative: two ways to one covariance
 
 
-def statements(result: Outcome) -> dict[str, list[Statement]]:
+def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """Theorems, special cases, successors, and what is often taken for granted."""
     parts = _critical, _bounds, _meeting, _losses, _errata
-    return {"papers": [statement for part in parts for statement in part(result)]}
+    return {"papers": [statement for part in parts for statement in part(outcome)]}
 
 
 def _critical(result: Outcome) -> list[Statement]:
@@ -41,8 +41,8 @@ def _critical(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _predicted(result: Outcome) -> float:
-    return threshold(result.setting.scalar.transition[0, 0])
+def _predicted(outcome: Outcome) -> float:
+    return threshold(outcome.setting.scalar.transition[0, 0])
 
 
 def _critical_arrival(
@@ -56,14 +56,14 @@ def _as_predicted(result: float, predicted: float) -> Verdict:
     return holds(abs(result - predicted) < THRESHOLD)
 
 
-def _bounds(result: Outcome) -> list[Statement]:
-    links = {"scalar": result.scalar, "coupled": result.coupled, "one unstable": result.one_unstable}
+def _bounds(outcome: Outcome) -> list[Statement]:
+    links = {"scalar": outcome.scalar, "coupled": outcome.coupled, "one unstable": outcome.one_unstable}
     ours = "; ".join(f"{name}: {_between(link)}" for name, link in links.items())
-    bursts = "; ".join(f"fail {b.fail:g}, recover {b.recover:g}: {_between(b)}" for b in result.bursts)
-    last, scalar = result.bursts[-1], result.scalar
+    bursts = "; ".join(f"fail {b.fail:g}, recover {b.recover:g}: {_between(b)}" for b in outcome.bursts)
+    last, scalar = outcome.bursts[-1], outcome.scalar
     each_link = {f"{key}_of_{name.replace(' ', '_')}": value
                  for name, link in links.items() for key, value in _numbers(link).items()}  # fmt: skip
-    each_burst = {f"{key}_of_{i}": value for i, b in enumerate(result.bursts) for key, value in _numbers(b).items()}
+    each_burst = {f"{key}_of_{i}": value for i, b in enumerate(outcome.bursts) for key, value in _numbers(b).items()}
     same = {"bound": last.bound, "bound_independent": scalar.bound, "mean": last.mean_error,
             "mean_independent": scalar.mean_error}  # fmt: skip
     return [
@@ -110,18 +110,18 @@ def _between(link: Link) -> str:
     return f"{link.lower:.6g} ≤ {mean} ≤ {link.bound:.8g}"
 
 
-def _meeting(result: Outcome) -> list[Statement]:
+def _meeting(outcome: Outcome) -> list[Statement]:
     def gap(*names: str) -> Evidence:
-        return {f"gap_of_{name}": result.critical[name].upper - result.critical[name].lower for name in names}
+        return {f"gap_of_{name}": outcome.critical[name].upper - outcome.critical[name].lower for name in names}
 
     def both(name: str) -> str:
-        return f"{result.critical[name].lower:.6f} and {result.critical[name].upper:.6f}"
+        return f"{outcome.critical[name].lower:.6f} and {outcome.critical[name].upper:.6f}"
 
-    shrinking, growing, turning = (_ratio(values) for values in (result.between, result.below, result.turning[::2]))
+    shrinking, growing, turning = (_ratio(values) for values in (outcome.between, outcome.below, outcome.turning[::2]))
     ours = (
-        f"at arrival {result.setting.between:g}, over all patterns of {len(result.between) - 1} steps, the last "
+        f"at arrival {outcome.setting.between:g}, over all patterns of {len(outcome.between) - 1} steps, the last "
         f"increment of E tr P is {shrinking:.3f} of the one before; below the lower condition {growing:.3f}; the "
-        f"bound's would grow by {result.between_bound:.3f}. Evidence, no proof"
+        f"bound's would grow by {outcome.between_bound:.3f}. Evidence, no proof"
     )
     return [
         Statement("The two conditions meet where the output shows the whole state", f"{SINOPOLI}, C invertible", "meet",
@@ -129,15 +129,15 @@ def _meeting(result: Outcome) -> list[Statement]:
         Statement("The conditions meet where one eigenvalue is unstable", f"{SINOPOLI}, special case", "meet",
             both("one_unstable"), gap("one_unstable"), _meet),
         Statement("The conditions always meet", "asked since 2004", "open there", f"coupled example: {both('coupled')}",
-            gap(*result.critical), _meet),
+            gap(*outcome.critical), _meet),
         Statement("With distinct moduli of the unstable eigenvalues the lower condition is the truth",
             "You, Fu and Xie (2011); Mo and Sinopoli (2012)", "proved there", ours,
             {"between": shrinking, "below": growing},
             lambda between, below: holds(between < SHRINKS and below > 1)),
         Statement("The lower condition is the truth for every plant", "taken for granted at times", "1 - 1/ρ²",
             "turned by 90 degrees a step and received in one coordinate, 1.3 times larger each time: arrival "
-            f"{sum(result.critical['turning'][:2]) / 2:.3f} lies above it, and the increments of E tr P over two steps "
-            f"grow by {turning:.3f}", {"turning": turning}, lambda turning: holds(turning < SHRINKS)),
+            f"{sum(outcome.critical['turning'][:2]) / 2:.3f} lies above it, and the increments of E tr P over two "
+            f"steps grow by {turning:.3f}", {"turning": turning}, lambda turning: holds(turning < SHRINKS)),
     ]  # fmt: skip
 
 
@@ -151,25 +151,26 @@ def _ratio(values: np.ndarray) -> float:
     return float(increments[-1] / increments[-2])
 
 
-def _losses(result: Outcome) -> list[Statement]:
-    v, factors = result.verdicts, np.diag(result.setting.components.transition)
+def _losses(outcome: Outcome) -> list[Statement]:
+    v, factors = outcome.verdicts, np.diag(outcome.setting.components.transition)
     expected = [threshold(factor) for factor in factors]
-    components = {"first": result.components[0], "second": result.components[1], "first_predicted": expected[0],
+    components = {"first": outcome.components[0], "second": outcome.components[1], "first_predicted": expected[0],
                   "second_predicted": expected[1], "certified_above": float(v["both_above"] == "certified"),
                   "impossible_below": float(v["first_below"] == v["second_below"] == "impossible")}  # fmt: skip
-    recoveries = ", ".join(f"{r:.6f} (fail {f:g})" for f, r in result.recovery.items())
-    needed = {f"recovery_at_{f:g}": r for f, r in result.recovery.items()}
+    recoveries = ", ".join(f"{r:.6f} (fail {f:g})" for f, r in outcome.recovery.items())
+    needed = {f"recovery_at_{f:g}": r for f, r in outcome.recovery.items()}
     return [
         Statement("Components lost on their own, of a plant without coupling, have thresholds of their own",
             "Liu and Goldsmith (2004)", "1 - 1/a_i^2: 0.84 and 0.5556",
-            f"{result.components[0]:.6f} and {result.components[1]:.6f}; both above: {v['both_above']}, one below: "
-            f"{v['first_below']}", components, _of_their_own),
+            f"{outcome.components[0]:.6f} and {outcome.components[1]:.6f}; both above: {v['both_above']}, one below: "
+            f"{v['first_below']}", components, _by_component),
         Statement("In bursts, a scalar plant's error is bounded if recovery > 1 - 1/a^2, however often links fail",
-            "Huang and Dey (2007)", "0.36", recoveries, {**needed, "predicted": _predicted(result)}, _all_as_predicted),
+            "Huang and Dey (2007)", "0.36", recoveries,
+            {**needed, "predicted": _predicted(outcome)}, _all_as_predicted),
     ]  # fmt: skip
 
 
-def _of_their_own(
+def _by_component(
     first: float,
     second: float,
     first_predicted: float,
@@ -185,11 +186,14 @@ def _all_as_predicted(predicted: float, **result: float) -> Verdict:
     return holds(all(abs(value - predicted) < THRESHOLD for value in result.values()))
 
 
-def _errata(result: Outcome) -> list[Statement]:
-    it, constant, scalar = result.iterated, result.constant, result.critical["scalar"]
-    right = abs(it.joseph[-1] / result.coupled.bound - 1)
-    wrong = abs(it.subtracted[-1] / result.coupled.bound - 1)
-    unknown_losses = "; ".join(f"{name}: {item.verdict}, {item.reason}" for name, item in result.unknown_losses.items())
+def _errata(outcome: Outcome) -> list[Statement]:
+    it, constant, scalar = outcome.iterated, outcome.constant, outcome.critical["scalar"]
+    right = abs(it.joseph[-1] / outcome.coupled.bound - 1)
+    wrong = abs(it.subtracted[-1] / outcome.coupled.bound - 1)
+    unknown_losses = "; ".join(
+        f"{name}: {unknown_loss.verdict}, {unknown_loss.reason}"
+        for name, unknown_loss in outcome.unknown_losses.items()
+    )
     return [
         Statement("A V A' + Q - arrival K S K' can be iterated as it stands", "the equation as printed everywhere",
             "exact arithmetic", f"coupled example, {len(it.joseph)} steps: tr V = {it.subtracted[-1]:.6g}, since V's "
@@ -203,10 +207,10 @@ def _errata(result: Outcome) -> list[Statement]:
             lambda fixed_gain, known: holds(fixed_gain - known < THRESHOLD)),
         Statement("Losses that are not observed have a critical probability too", "taken for granted at times",
             "a threshold", unknown_losses,
-            {"impossible": float(sum(item.verdict == "impossible" for item in result.unknown_losses.values()))},
+            {"impossible": float(sum(item.verdict == "impossible" for item in outcome.unknown_losses.values()))},
             lambda impossible: holds(impossible == 0)),
         Statement("Where E P diverges, so does P", "refuted by Shi, Epstein and Murray (2010)", "diverges",
-            f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is {result.typical:.3f} "
+            f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is {outcome.typical:.3f} "
             "after 100 steps; the mean is infinite for its rare long losses",
-            {"median": result.typical}, lambda median: holds(median > DIVERGED)),
+            {"median": outcome.typical}, lambda median: holds(median > DIVERGED)),
     ]  # fmt: skip

@@ -76,7 +76,7 @@ class Statistics:
     run_max: int
     lost_after_lost: float
     out_of_order: float
-    out_of_order_own: float
+    out_of_order_by_node: float
     copies: float
     delay_median: float
     delay_95: float
@@ -102,7 +102,7 @@ def statistics(packets: Packets) -> Statistics:
         run_max=int(runs.max(initial=0)),
         lost_after_lost=float(after[before].mean()) if before.any() else 0.0,
         out_of_order=float(_overtaken(local.sent).mean()),
-        out_of_order_own=float(np.concatenate([_overtaken(sent) for sent in by_node]).mean()),
+        out_of_order_by_node=float(np.concatenate([_overtaken(sent) for sent in by_node]).mean()),
         copies=1 - len(local) / len(packets),
         delay_median=float(np.median(delay)),
         delay_95=float(np.quantile(delay, 0.95)),

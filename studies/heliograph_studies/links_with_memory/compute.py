@@ -118,13 +118,13 @@ def simulated(
     record = hg.monte_carlo(hg.Network(plant, nodes), horizon, runs, seed, progress=progress)
     result = {}
     for name, (_, filters) in places.items():
-        for item in filters:
-            squares = record.errors(name, item)[..., 0] ** 2
-            estimate = record.estimates[name][item]
+        for filter in filters:
+            squares = record.errors(name, filter)[..., 0] ** 2
+            estimate = record.estimates[name][filter]
             claimed = np.broadcast_to(estimate.covariance[..., 0, 0], squares.shape).mean(axis=0)
             by_run = squares[:, begin:].mean(axis=1)
             averages = float(claimed[begin:].mean()), float(by_run.mean()), float(by_run.std() / np.sqrt(runs))
-            result[item] = Score(estimate.claim, *averages, claimed, squares.mean(axis=0))
+            result[filter] = Score(estimate.claim, *averages, claimed, squares.mean(axis=0))
     return result
 
 

@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
-from heliograph.serving.plant import Link
-from heliograph.serving.storage.plant_codec import plant_from
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
+from heliograph.live.plant import Link
+from heliograph.live.plant_codec import plant_from
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, Killed, killed, left_alone

@@ -10,10 +10,10 @@ import nats
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import Address, address
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
 from heliograph.serving.message import Message
 from heliograph.serving.output import Output

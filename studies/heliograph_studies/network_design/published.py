@@ -24,7 +24,7 @@ class Circuit(NamedTuple):
 def circuit() -> Circuit:
     """Relays designed for the best receiver behind them, not each for its own error, in the published network."""
     network = setting.circuit()
-    as_published = hg.relays.periodic_own_error_design(network)
+    as_published = hg.relays.periodic_local_error_design(network)
     power, published = as_published.total_power(), float(as_published.trace("receiver")[1:].sum())
     start = {name: np.zeros((2, 3, 1)) for name in setting.QUIET}
     for name, (slot, gains) in setting.QUIET.items():

@@ -71,7 +71,7 @@ def over_time(covariance: np.ndarray) -> dict[Any, float]:
 def relay_traces() -> dict[int, dict[str, float]]:
     """tr Cov(x_k | z_1 ... z_{k + lag}) at an even and an odd step of the receiver in its steady state."""
     network = successive_relays.Setting().network()
-    gains = hg.relays.own_error_design(network, models.STEADY).gains
+    gains = hg.relays.local_error_design(network, models.STEADY).gains
     receiver = hg.filters.LinearSystemFilter(hg.relays.receiver_system(network, gains))
     _, steps = hg.smoothing.smoother_steps(receiver, np.zeros((models.STEADY, 1)))
     even = (models.STEADY - max(RELAY_LAGS) - 2) // 2 * 2

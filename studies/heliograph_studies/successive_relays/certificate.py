@@ -87,22 +87,23 @@ def certify_relays(network: RelayNetwork, gains: GainsByFilter) -> RelayCertific
     return RelayCertificate({bound.name: bound for bound in bounds}, c, result)
 
 
-def _greedy(result: Recomputed) -> Assumption:
-    largest = max(float(np.max(value)) for value in result.correlation.values())
+def _greedy(recomputed: Recomputed) -> Assumption:
+    largest = max(float(np.max(value)) for value in recomputed.correlation.values())
     text = "every gain minimises its filter's own next error (error and innovation uncorrelated)"
     return Assumption(text, f"correlation {largest:.2g}", largest <= GREEDY)
 
 
-def _state_bound(steps: Steps, result: Recomputed, greedy: Assumption) -> Bound:
+def _state_bound(steps: Steps, recomputed: Recomputed, greedy: Assumption) -> Bound:
     """E e_f e_f' <= cov x_k; the values are the largest eigenvalues of cov x_k."""
     radius = max(float(np.max(np.abs(np.linalg.eigvals(a)))) for a in steps.transition)
     still = bool(np.all(steps.transition == steps.transition[0]))
     stable = Assumption("a constant plant with spectral radius below 1", f"{radius:.6g}", still and radius < 1)
-    size = np.trace(result.state, axis1=1, axis2=2)
+    size = np.trace(recomputed.state, axis1=1, axis2=2)
     gap = min(
-        float(np.min(np.linalg.eigvalsh(result.state - error)[:, 0] / size)) for error in result.covariance.values()
+        float(np.min(np.linalg.eigvalsh(recomputed.state - error)[:, 0] / size))
+        for error in recomputed.covariance.values()
     )
-    values = np.linalg.eigvalsh(result.state)[:, -1]
+    values = np.linalg.eigvalsh(recomputed.state)[:, -1]
     return Bound("state covariance", "E e e' <= cov x", (greedy, stable), values, gap >= -ROUNDING)
 
 

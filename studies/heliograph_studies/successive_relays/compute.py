@@ -97,7 +97,7 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 def design(setting: Setting) -> Designs:
     """All designs over the horizon."""
     network, horizon = setting.network(), setting.horizon
-    paper = hg.relays.own_error_design(network, horizon)
+    paper = hg.relays.local_error_design(network, horizon)
     tuned = hg.relays.receiver_error_design(network, horizon)
     limit = paper.total_power()
     bounded = hg.relays.receiver_error_design(network, horizon, power_limit=limit, sweeps=setting.sweeps)
@@ -124,7 +124,7 @@ def wrong(setting: Setting) -> dict[str, Misprinted]:
 def steady(setting: Setting) -> dict[str, Steady]:
     """The two-periodic steady state of each design."""
     network = setting.network()
-    paper = hg.relays.periodic_own_error_design(network)
+    paper = hg.relays.periodic_local_error_design(network)
     listen = {"relay_1": 1, "relay_2": 0}  # slots: odd, even
     start = {name: np.zeros((2, 3, 1)) for name in listen}
     for name, slot in listen.items():
@@ -157,7 +157,7 @@ def _behind(network: hg.model.RelayNetwork, gains: GainsByFilter) -> Steady:
 
 def _without_relay(setting: Setting, direct: hg.random_affine.GainAndNoise) -> Steady:
     """Trace of the error of x_(k+1) predicted from what was received up to k: as late as behind a relay."""
-    filtered = hg.relays.periodic_own_error_design(setting.without_relays(direct)).covariance["receiver"][-1]
+    filtered = hg.relays.periodic_local_error_design(setting.without_relays(direct)).covariance["receiver"][-1]
     a = setting.transition
     value = float(np.trace(a @ filtered @ a.T + setting.process_covariance))
     return Steady(value, value, np.zeros(2))
@@ -166,7 +166,7 @@ def _without_relay(setting: Setting, direct: hg.random_affine.GainAndNoise) -> S
 def limits(setting: Setting) -> dict[str, float]:
     """Other steady traces to compare with: filtered without relays, and nothing received."""
     filtered = {
-        name: float(hg.relays.periodic_own_error_design(setting.without_relays(direct)).trace("receiver")[-1])
+        name: float(hg.relays.periodic_local_error_design(setting.without_relays(direct)).trace("receiver")[-1])
         for name, direct in (("no_relay_filtered", setting.link(1)), ("sensor_itself_filtered", hg.perfect()))
     }
     covariance, a = setting.initial_covariance, setting.transition
@@ -229,7 +229,7 @@ def counterexample() -> RelayCertificate:
         {"relay_1": {"sensor": noisy, "relay_2": quiet}, "receiver": {"relay_2": noisy}},
     ]
     network = hg.model.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
-    return certify_relays(network, hg.relays.own_error_design(network, 60).gains)
+    return certify_relays(network, hg.relays.local_error_design(network, 60).gains)
 
 
 def write_record(outcome: Outcome, folder: Path) -> None:

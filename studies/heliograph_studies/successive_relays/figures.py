@@ -24,31 +24,31 @@ TITLES = {
 UNITS = ("V", "V", "A")
 
 
-def figures(result: Outcome) -> dict[str, Figure]:
+def figures(outcome: Outcome) -> dict[str, Figure]:
     """Figs 2 to 5 by file name, and the tuned designs."""
-    drawn = {f"fig{2 + i}_{state}": _trajectory(result, i) for i, state in enumerate(STATES)}
-    drawn["fig5_traces"] = _traces(result)
-    drawn["tuned"] = _tuned(result)
+    drawn = {f"fig{2 + i}_{state}": _trajectory(outcome, i) for i, state in enumerate(STATES)}
+    drawn["fig5_traces"] = _traces(outcome)
+    drawn["tuned"] = _tuned(outcome)
     return drawn
 
 
-def _trajectory(result: Outcome, i: int) -> Figure:
-    assert result.shown.truth is not None
-    curves = [Curve("true", INK, result.shown.truth[0, :, i])]
+def _trajectory(outcome: Outcome, i: int) -> Figure:
+    assert outcome.shown.truth is not None
+    curves = [Curve("true", INK, outcome.shown.truth[0, :, i])]
     for name in FILTERS:
         curves.append(
-            Curve(LABELS[name], COLOURS[name], np.asarray(result.shown.estimates[name]["local"].mean)[0, :, i])
+            Curve(LABELS[name], COLOURS[name], np.asarray(outcome.shown.estimates[name]["local"].mean)[0, :, i])
         )
     label = f"{STATES[i].replace('_', ' ')} ({UNITS[i]})"
-    return curves_over_time(result.shown.time, [Panel(label, curves)], "step k")
+    return curves_over_time(outcome.shown.time, [Panel(label, curves)], "step k")
 
 
-def _traces(result: Outcome) -> Figure:
-    time = np.arange(result.setting.horizon + 1)
-    designed = [Curve(LABELS[f], COLOURS[f], np.log10(result.designs.paper.trace(f))) for f in FILTERS]
-    simulated = result.simulated
-    ratio = simulated.mean["receiver"] / result.designs.paper.trace("receiver")
-    band = simulated.error["receiver"] / result.designs.paper.trace("receiver")
+def _traces(outcome: Outcome) -> Figure:
+    time = np.arange(outcome.setting.horizon + 1)
+    designed = [Curve(LABELS[f], COLOURS[f], np.log10(outcome.designs.paper.trace(f))) for f in FILTERS]
+    simulated = outcome.simulated
+    ratio = simulated.mean["receiver"] / outcome.designs.paper.trace("receiver")
+    band = simulated.error["receiver"] / outcome.designs.paper.trace("receiver")
     panels = [
         Panel("log10 of error variance", designed),
         Panel("simulated / computed", [Curve("receiver", BLUE, ratio), Curve("+2 s.e.", MUTED, 1 + 2 * band),
@@ -57,9 +57,9 @@ def _traces(result: Outcome) -> Figure:
     return curves_over_time(time, panels, "step k")
 
 
-def _tuned(result: Outcome) -> Figure:
-    time, paper = np.arange(1, result.setting.horizon + 1), result.designs.paper
-    designs = {"free power": (GREEN, result.designs.tuned), "same power": (PURPLE, result.designs.bounded)}
+def _tuned(outcome: Outcome) -> Figure:
+    time, paper = np.arange(1, outcome.setting.horizon + 1), outcome.designs.paper
+    designs = {"free power": (GREEN, outcome.designs.tuned), "same power": (PURPLE, outcome.designs.bounded)}
     trace, power = paper.trace("receiver")[1:], paper.total_power()
     panels = [
         Panel("error / paper's", [Curve(n, c, d.trace("receiver")[1:] / trace) for n, (c, d) in designs.items()]),
@@ -68,14 +68,14 @@ def _tuned(result: Outcome) -> Figure:
     return curves_over_time(time, panels, "step k")
 
 
-def words(result: Outcome) -> dict[str, object]:
+def words(outcome: Outcome) -> dict[str, object]:
     """Titles, colours, and the rows of three tables."""
-    designs, total = result.designs, {name: s.even + s.odd for name, s in result.states.items()}
-    z, where = worst_z(result)
+    designs, total = outcome.designs, {name: s.even + s.odd for name, s in outcome.states.items()}
+    z, where = worst_z(outcome)
     rows = [
         (TITLES[name], s.even, s.odd, total[name] / total["paper"],
-         " / ".join(f"{p:.3f}" for p in s.power / result.states["paper"].power) if np.any(s.power) else "none")
-        for name, s in ((name, result.states[name]) for name in TITLES if name in result.states)
+         " / ".join(f"{p:.3f}" for p in s.power / outcome.states["paper"].power) if np.any(s.power) else "none")
+        for name, s in ((name, outcome.states[name]) for name in TITLES if name in outcome.states)
     ]  # fmt: skip
     names = {"the paper's gains": designs.paper, "chosen for the receiver": designs.tuned,
              "the same, at the paper's power": designs.bounded}  # fmt: skip
@@ -88,12 +88,12 @@ def words(result: Outcome) -> dict[str, object]:
         "worse": [designs.tuned.trace(f)[-1] / designs.paper.trace(f)[-1] for f in ("relay_2", "receiver")],
         "z": z,
         "where": where,
-        "limit": z_limit(result.setting.horizon + 1),
+        "limit": z_limit(outcome.setting.horizon + 1),
         "rows": rows,
         "early": [
             (name, d.trace("receiver") / designs.paper.trace("receiver"),
              d.total_power() / designs.paper.total_power(), d.trace("relay_2")[-1])
             for name, d in names.items()
         ],
-        "published_bounds": result.certificates["paper"].bounds.values(),
+        "published_bounds": outcome.certificates["paper"].bounds.values(),
     }  # fmt: skip

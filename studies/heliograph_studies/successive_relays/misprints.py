@@ -71,7 +71,7 @@ def _largest_noise() -> float:
     plant = hg.LinearPlant(0.1 * np.eye(2), np.diag([0.01, 1.0]), np.zeros(2), 0.01 * np.eye(2))
     sensor = hg.LinearSensor([[1.0, 1.0]], [[1.0]])
     network = _alternating(plant, sensor, shadowing(0.5, 0.1), 1e6, 1e6)
-    return float(np.linalg.eigvalsh(hg.relays.own_error_design(network, 40).covariance["relay_1"][-1])[0])
+    return float(np.linalg.eigvalsh(hg.relays.local_error_design(network, 40).covariance["relay_1"][-1])[0])
 
 
 def _noise_squared() -> tuple[float, int, tuple[float, float]]:
@@ -84,12 +84,12 @@ def _noise_squared() -> tuple[float, int, tuple[float, float]]:
         factors = [o / (o + 4 * upper) for o in (noise**2, noise)]
         bounds = [tau * factor * bound + w for factor, bound in zip(factors, bounds, strict=True)]
         upper = tau * upper + w
-    return float(hg.relays.own_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
+    return float(hg.relays.local_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
 
 
-def misprints(result: Outcome) -> list[Statement]:
+def misprints(outcome: Outcome) -> list[Statement]:
     """In the recursion."""
-    wrong = result.misprints
+    wrong = outcome.misprints
     more, less = wrong["lemma_1_process"], wrong["lemma_1_sensor_noise"]
     gain, seventh = wrong["theorem_1"], wrong["lemma_7"]
     return [
@@ -112,30 +112,30 @@ def misprints(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _judged(result: Misprinted) -> tuple[Evidence, Callable[..., Verdict]]:
+def _judged(misprinted: Misprinted) -> tuple[Evidence, Callable[..., Verdict]]:
     """Steady trace claimed and true trace, relative to the right recursion: 1 if the misprint does nothing."""
     return (
-        {"claimed": float(result.claimed[-1]), "true": float(result.true[-1])},
+        {"claimed": float(misprinted.claimed[-1]), "true": float(misprinted.true[-1])},
         lambda claimed, true: holds(max(abs(claimed - 1), abs(true - 1)) <= ROUNDING),
     )
 
 
-def _effect(result: Misprinted, k: int) -> str:
-    return f"claimed tr P is {result.claimed[k]:.2f} of the truth, and the truth {_percent(result.true[k])}"
+def _effect(misprinted: Misprinted, k: int) -> str:
+    return f"claimed tr P is {misprinted.claimed[k]:.2f} of the truth, and the truth {_percent(misprinted.true[k])}"
 
 
 def _percent(ratio: float) -> str:
     return f"{100 * (ratio - 1):+.1f} %"
 
 
-def circuit(result: Outcome) -> list[Statement]:
+def circuit(outcome: Outcome) -> list[Statement]:
     """In the example."""
     gap = {h: float(np.max(np.abs(matrix_of(h) - TRANSITION))) for h in (0.5, 5.0)}
-    printed = replace(result.setting, transition=matrix_of(0.5)).network()
-    other = hg.relays.own_error_design(printed, 10).trace("receiver")[10]
+    printed = replace(outcome.setting, transition=matrix_of(0.5)).network()
+    other = hg.relays.local_error_design(printed, 10).trace("receiver")[10]
     plus = matrix_of(5.0, second_sign=1.0)
     radius, wrong = float(np.max(np.abs(np.linalg.eigvals(plus)))), float(np.max(np.abs(plus - TRANSITION)))
-    remote = float(result.trace["remote"][10])
+    remote = float(outcome.trace["remote"][10])
     return [
         Statement("L = 0.5 H gives the printed Γ", "Section IV", "0.5 H",
             f"largest difference {gap[0.5]:.3f}; 5 H gives it to {gap[5.0]:.1g} (four printed decimals). With 0.5 H tr "

@@ -18,19 +18,19 @@ LITTLE = 0.05  # a relative difference that does not matter
 HALF = 0.25  # of a mean squared error: half the error
 
 
-def statements(result: Outcome) -> dict[str, list[Statement]]:
+def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """All of them: results first, then bounds, then misprints."""
     return {
-        "filters": [*_designs(result), *_estimates(result)],
-        "bounds": [*_bounds(result), *_scalar_bounds(result), *proofs()],
-        "formulas": [*misprints(result), *circuit(result)],
+        "filters": [*_designs(outcome), *_estimates(outcome)],
+        "bounds": [*_bounds(outcome), *_scalar_bounds(outcome), *proofs()],
+        "formulas": [*misprints(outcome), *circuit(outcome)],
     }
 
 
-def worst_z(result: Outcome, name: str = "receiver") -> tuple[float, int]:
+def worst_z(outcome: Outcome, name: str = "receiver") -> tuple[float, int]:
     """Largest |designed - simulated| in standard errors over k = 0 .. horizon, and where."""
-    simulated = result.simulated
-    z = np.abs(simulated.mean[name] - result.designs.paper.trace(name)) / simulated.error[name]
+    simulated = outcome.simulated
+    z = np.abs(simulated.mean[name] - outcome.designs.paper.trace(name)) / simulated.error[name]
     return float(z.max()), int(z.argmax())
 
 
@@ -39,9 +39,9 @@ def z_limit(steps: int) -> float:
     return float(stats.t.isf(FALSE_ALARM / 2 / steps, BATCHES - 1))
 
 
-def _totals(result: Outcome) -> dict[str, float]:
+def _totals(outcome: Outcome) -> dict[str, float]:
     """The steady sums of two steps, by design."""
-    return {name: value.even + value.odd for name, value in result.states.items()}
+    return {name: value.even + value.odd for name, value in outcome.states.items()}
 
 
 def _designs(result: Outcome) -> list[Statement]:
@@ -90,24 +90,24 @@ def _designs(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _estimates(result: Outcome) -> list[Statement]:
-    paper, best = result.designs.paper, result.designs.best_behind
+def _estimates(outcome: Outcome) -> list[Statement]:
+    paper, best = outcome.designs.paper, outcome.designs.best_behind
     trace, state = paper.trace("receiver"), np.trace(paper.moments[:, :3, :3], axis1=1, axis2=2)
-    track, total = {f"relative_error_at_{k}": _relative(result, k) for k in (10, 50, 100)}, _totals(result)
+    track, total = {f"relative_error_at_{k}": _relative(outcome, k) for k in (10, 50, 100)}, _totals(outcome)
     first = float(np.max(np.abs(paper.gains["receiver"][0])))
     return [
         Statement("the estimates track the state", "Section IV, Figs. 2 to 4", "competent",
-            f"rms error / rms state {_relative(result, 10):.3f} at k = 10, {_relative(result, 50):.3f} at 50, "
-            f"{_relative(result, 100):.3f} at 100; tr P / tr(nothing received) {trace[2] / state[2]:.2f} at k = 2, "
-            f"{trace[10] / state[10]:.3f} at 10, {total['paper'] / 2 / result.limits['nothing_received']:.3f} steady",
-            {**track, "steady_over_nothing_received": total["paper"] / 2 / result.limits["nothing_received"]},
+            f"rms error / rms state {_relative(outcome, 10):.3f} at k = 10, {_relative(outcome, 50):.3f} at 50, "
+            f"{_relative(outcome, 100):.3f} at 100; tr P / tr(nothing received) {trace[2] / state[2]:.2f} at k = 2, "
+            f"{trace[10] / state[10]:.3f} at 10, {total['paper'] / 2 / outcome.limits['nothing_received']:.3f} steady",
+            {**track, "steady_over_nothing_received": total["paper"] / 2 / outcome.limits["nothing_received"]},
             lambda relative_error_at_10, relative_error_at_50, relative_error_at_100, steady_over_nothing_received:
             holds(
                 max(relative_error_at_10, relative_error_at_50, relative_error_at_100) < 1 / 2
                 and steady_over_nothing_received < HALF)),
         Statement("the state is estimated accurately", "Section IV, Fig. 5", "a desired performance",
             f"steady tr P is {total['paper'] / 2:.4g}, {total['paper'] / total['no_relay']:.2f} times what one hop "
-            f"without relays gives as late ({total['no_relay'] / 2:.4g}; {result.limits['no_relay_filtered']:.4g} "
+            f"without relays gives as late ({total['no_relay'] / 2:.4g}; {outcome.limits['no_relay_filtered']:.4g} "
             f"without delay), and {total['paper'] / total['sensor_itself']:.2f} times the floor for every receiver "
             f"behind the relays, {total['sensor_itself'] / 2:.4g}",
             {"over_the_floor": total["paper"] / total["sensor_itself"]},
@@ -124,32 +124,32 @@ def _estimates(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _relative(result: Outcome, k: int) -> float:
+def _relative(outcome: Outcome, k: int) -> float:
     """Root of tr P_k over the root of E |x_k|^2."""
-    paper, setting = result.designs.paper, result.setting
+    paper, setting = outcome.designs.paper, outcome.setting
     mean = np.linalg.matrix_power(setting.transition, k) @ setting.initial_mean
     state = np.trace(paper.moments[k, :3, :3]) + float(np.sum(mean**2))
     return float(np.sqrt(paper.trace("receiver")[k] / state))
 
 
-def _without_fading(result: Outcome) -> float:
+def _without_fading(outcome: Outcome) -> float:
     """tr P_10 with every gain at its mean."""
-    network = result.setting.network()
+    network = outcome.setting.network()
     slots = [
         {listener: {s: hg.model.mean_gain(link) for s, link in links.items()} for listener, links in slot.items()}
         for slot in network.slots
     ]
     certain = hg.model.RelayNetwork(network.plant, network.sensor, ("relay_1", "relay_2"), slots)
-    return float(hg.relays.own_error_design(certain, 10).trace("receiver")[10])
+    return float(hg.relays.local_error_design(certain, 10).trace("receiver")[10])
 
 
-def _bounds(result: Outcome) -> list[Statement]:
-    certificate, tuned = result.certificates["paper"], result.certificates["tuned"]
+def _bounds(outcome: Outcome) -> list[Statement]:
+    certificate, tuned = outcome.certificates["paper"], outcome.certificates["tuned"]
     bounds = certificate.bounds
-    truth = float(result.trace["remote"][-1])
+    truth = float(outcome.trace["remote"][-1])
     upper, lower, alpha = bounds["Theorem 3, upper"], bounds["Theorem 3, lower"], bounds["Theorem 4, lower"]
     state = bounds["state covariance"]
-    least = {name: min(_below_state(result.certificates[name], f) for f in FILTERS) for name in ("paper", "tuned")}
+    least = {name: min(_below_state(outcome.certificates[name], f) for f in FILTERS) for name in ("paper", "tuned")}
     assert upper.values is not None and alpha.values is not None and state.values is not None
     return [
         Statement("Ξᵢ ≤ m̄ₖ I and Pₖ ≤ m̄ₖ I", "Theorems 3 and 4, upper", "bounded",
@@ -181,9 +181,9 @@ def _bounds(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _scalar_bounds(result: Outcome) -> list[Statement]:
-    scalar, printed = result.certificates["scalar"].bounds, _printed_scalar()
-    remote, relay = (_scalar_limit(result, name) for name in ("receiver", "relay_1"))
+def _scalar_bounds(outcome: Outcome) -> list[Statement]:
+    scalar, printed = outcome.certificates["scalar"].bounds, _printed_scalar()
+    remote, relay = (_scalar_limit(outcome, name) for name in ("receiver", "relay_1"))
     highest = [scalar[name].values for name in ("Lemma 8, upper", "Lemma 9, upper")]
     tops = max(values[0] for values in highest if values is not None)
     return [
@@ -212,8 +212,8 @@ def _conditional(bound: Bound) -> tuple[Evidence, Callable[..., Verdict]]:
     )
 
 
-def _scalar_limit(result: Outcome, name: str) -> float:
-    return float(result.certificates["scalar"].recomputed.covariance[name][-1, 0, 0])
+def _scalar_limit(outcome: Outcome, name: str) -> float:
+    return float(outcome.certificates["scalar"].recomputed.covariance[name][-1, 0, 0])
 
 
 def _printed_scalar() -> dict[str, float]:

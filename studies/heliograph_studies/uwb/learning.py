@@ -83,7 +83,7 @@ def followed(rule: str, numbers: Sequence[Numbers], data: "Padded") -> Followed:
 
     Source: Magill, Optimal adaptive estimation of sampled stochastic processes (1965), for the mixture.
     """
-    sized = [versions(rule, item) for item in numbers]
+    sized = [versions(rule, number) for number in numbers]
     runs, sizes = len(sized), len(sized[0])
     rows = [np.repeat(part, sizes, axis=0) for part in data]
     result = hg.simulation.over_runs(single(rule), np.reshape(sized, (runs * sizes, -1)), *rows)
@@ -178,7 +178,7 @@ def learn(rule: str, drives: Sequence[Drive], iterations: int, progress: Callabl
         """Mean over the drives at each set of numbers, all side by side as runs of one program."""
         numbers = [numbers_of(rule, line) for line in lines]
         runs = Padded(*(np.concatenate([x] * len(lines)) for x in data))
-        result = followed(rule, [item for item in numbers for _ in drives], runs)
+        result = followed(rule, [number for number in numbers for _ in drives], runs)
         values = [
             density(drive, numbers[i].late, result.place[k], result.covariance[k])
             for i in range(len(lines))

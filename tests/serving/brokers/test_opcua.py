@@ -9,14 +9,14 @@ pytest.importorskip("asyncua")
 from asyncua import Server, ua
 
 import heliograph as hg
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
 from heliograph.serving.brokers.opcua import OF_RANGE, Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import address
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import free_port

@@ -121,8 +121,8 @@ def test_lines_with_a_topic_are_those_of_mosquitto_sub(translator):
 
 
 def test_sources_and_parts_exclude_each_other():
+    from heliograph.live.fleet import Options
     from heliograph.serving.brokers.url import address
-    from heliograph.serving.fleet import Options
     from heliograph.serving.running import ServiceSettings
 
     plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.serving.service import Service
-from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
 from tests.serving.worlds import fleet, lines, messages, moving, stepping

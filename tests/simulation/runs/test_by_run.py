@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import read_recording
-from heliograph.relays.design import own_error_design, relay_schedules
+from heliograph.relays.design import local_error_design, relay_schedules
 from heliograph.simulation.runs.by_run import trajectories
 from tests.relays.relay_problems import example
 
@@ -80,7 +80,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
 
 def test_columns_of_what_relays_received_may_be_left_out():
     net = example()
-    schedules = relay_schedules(net, own_error_design(net, 4))
+    schedules = relay_schedules(net, local_error_design(net, 4))
     receivers = {"local": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
     network = hg.Network.of_relays(net, schedules, receivers)
     z = np.linspace(0.1, 0.4, 4)

@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.codegen.engine import SETTING
 from heliograph.codegen.graph import Unsupported
-from heliograph.relays.design import own_error_design
+from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
@@ -77,7 +77,7 @@ NETWORKS = {
     "nonlinear": nonlinear,
     "with memory": with_memory,
     "shadowed": shadowed,
-    "relays": lambda: relays(example(), own_error_design(example(), 20)),
+    "relays": lambda: relays(example(), local_error_design(example(), 20)),
     "quantized": lambda: NETWORK,
 }
 

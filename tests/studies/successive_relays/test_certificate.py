@@ -6,7 +6,7 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.law import GivenMoments
-from heliograph.relays.design import own_error_design
+from heliograph.relays.design import local_error_design
 from heliograph.relays.receiver_error import receiver_error_design
 from heliograph_studies.successive_relays.certificate import certify_relays
 from tests.relays.relay_problems import example, unusual
@@ -14,7 +14,7 @@ from tests.relays.relay_problems import example, unusual
 
 @pytest.fixture(scope="module")
 def paper():
-    return certify_relays(example(), own_error_design(example(), 100).gains)
+    return certify_relays(example(), local_error_design(example(), 100).gains)
 
 
 def scalar(transition, initial, mean=0.5):
@@ -52,7 +52,7 @@ def test_tuned_gains_leave_the_bounds_proofs():
 
 def test_corrected_uniform_bounds_hold_where_the_printed_fail():
     net = scalar(0.5, 10.0)
-    result = certify_relays(net, own_error_design(net, 60).gains)
+    result = certify_relays(net, local_error_design(net, 60).gains)
     assert all(bound.applies and bound.holds for bound in result.bounds.values())
     last = result.recomputed.covariance["receiver"][-1, 0, 0]
     assert last == pytest.approx(1.333, abs=1e-3)
@@ -72,7 +72,7 @@ def test_every_bound_can_fail():
 
 def test_a_network_of_another_kind_gets_the_bounds_that_still_make_sense():
     net = unusual()
-    bounds = certify_relays(net, own_error_design(net, 9).gains).bounds
+    bounds = certify_relays(net, local_error_design(net, 9).gains).bounds
     assert bounds["state covariance"].holds and bounds["Theorem 3, upper"].holds
     assert "otherwise" in bounds["Theorem 3, lower"].failing[0]
     assert bounds["Theorem 4, lower"].values is None

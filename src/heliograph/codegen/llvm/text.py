@@ -230,8 +230,8 @@ class Writer:
         self.lines[place:place] = phis
         self.start(f"{name}.end")
         self.scopes.pop()
-        for k, result in zip(moving, finals, strict=True):
-            self._keep(loop.results[k], result)
+        for k, final in zip(moving, finals, strict=True):
+            self._keep(loop.results[k], final)
 
     def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
         """Write a loop that ends when no lane's condition holds."""

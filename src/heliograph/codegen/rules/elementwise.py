@@ -1,5 +1,6 @@
 """Rules of elementwise operations."""
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -111,6 +112,22 @@ def _square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     return graph.node("mul", type, x, x)
 
 
+def _one_minus_square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("sub", type, graph.constant(1.0, type), graph.node("mul", type, x, x))
+
+
+def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("mul", type, graph.node("log", type, x), graph.constant(1 / math.log(2), type))
+
+
+def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
+    """Evaluate a polynomial by Horner's rule, of coefficients from degree 0 up."""
+    result = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        result = graph.node("add", type, graph.node("mul", type, result, x), c)
+    return result
+
+
 def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     if int(params["rounding_method"]) != 1:
         raise Unsupported("rounding of halves away from zero")
@@ -130,6 +147,7 @@ RULES |= {
     "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
     "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
     "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
+    "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),
     "round": _composed(_round), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")

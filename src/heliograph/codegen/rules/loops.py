@@ -77,7 +77,7 @@ def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node]) -> list[np.ndarra
 
 def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
-    consts, carried, length = params["num_consts"], params["num_carry"], params["length"]
+    (consts, carried), length = _counts(params), params["length"]
     fixed, rows = inputs[:consts], inputs[consts + carried :]
     carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
     # Short loops are written out.
@@ -101,6 +101,14 @@ def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     )
     after = iter(moving)
     return [*(x if s else next(after) for x, s in zip(carry, same, strict=True)), *stacked]
+
+
+def _counts(params: dict[str, Any]) -> tuple[int, int]:
+    """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carried, _ = params["ft_in"].unpack()
+    return len(list(consts)), len(list(carried))
 
 
 def _written_out(

@@ -46,6 +46,11 @@ def _stack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
     return [np.stack(inputs, axis=equation.params["axis"])]
 
 
+def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    rows = np.moveaxis(inputs[0], equation.params["axis"], 0)
+    return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
+
+
 def _pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     x, filling = inputs
     result = np.empty(result_shape(equation), dtype=object)
@@ -137,6 +142,7 @@ RULES |= {
     "transpose": _moved(lambda x, params, shape: np.transpose(x, params["permutation"])),
     "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
-    "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack, "pad": _pad,
+    "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
+    "unstack": _unstack, "pad": _pad,
     "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip

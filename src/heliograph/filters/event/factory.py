@@ -54,6 +54,7 @@ def event_filter(
     check_link(first(sensor), first(channel), len(start.states))
     refuse_angles("event filter", plant, sensor)
     trigger.check_outputs(len(first(sensor).outputs))
+    # Law of what arrives, for each step.
     known, lost = check_count("known", known), check_count("lost", lost, 0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     described, initial = _described(channel)
@@ -61,6 +62,7 @@ def event_filter(
     outputs = len(first(sensor).outputs)
     loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
+    # A random trigger: one Gaussian is enough.
     if isinstance(trigger, StochasticTrigger | Periodic):
         sure = is_linear(plant, sensor) and all(_is_known(step) for step in steps) and not uncertain_chain(channel)
         hidden = loses and trigger.losses == "unknown" and isinstance(trigger, StochasticTrigger)

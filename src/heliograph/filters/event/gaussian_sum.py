@@ -221,6 +221,7 @@ class EventFilter(AbstractSizedFilter):
         self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[Parts, jax.Array, jax.Array]:
         """A value came: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
+        # Probability that this pattern of values arrives, by mode.
         local, there = self.senders[s], ~jnp.isnan(z)
         pattern = there if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
@@ -230,6 +231,7 @@ class EventFilter(AbstractSizedFilter):
         if self.trigger.losses == "numbered":
             number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
             label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
+        # Each mode's Gaussians, restricted to where the sender sends, then updated by the value.
         pieces, signals = [], []
         for j in range(1 if self.alike else label.shape[1]):
             only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
@@ -242,6 +244,7 @@ class EventFilter(AbstractSizedFilter):
             signals.append(
                 sent._replace(label=jnp.zeros((1, 1)))._replace(**arriving(sent, *link, local, self.outputs))
             )
+        # One sum again, with a new reference.
         item = join(together(pieces).keep(self._renewed(local)))
         item = item.labelled(s, _sent(item.label[:, s], False))
         signal = join(together(signals))

@@ -76,6 +76,7 @@ def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array |
     certain = variance <= CERTAIN * size
     deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
     low, high = (lower - centre) / deviation, (upper - centre) / deviation
+    # Moments of a standard normal number between the two, or beyond one.
     if above:
         moments = upper_tail(low)
     elif below:

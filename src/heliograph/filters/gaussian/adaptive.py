@@ -209,11 +209,11 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     )  # fmt: skip
 
 
-def _noise_of(item: GaussianFilter) -> ReceivedNoise | OverTime:
+def _noise_of(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """The sensor's noise as it arrives."""
-    steps = [part.steps for part in (item.sensor, item.channel) if isinstance(part, OverTime)]
+    steps = [part.steps for part in (filter.sensor, filter.channel) if isinstance(part, OverTime)]
     if not steps:
-        return received_noise(at(item.sensor, 0).noise, None, at(item.channel, 0), True)
+        return received_noise(at(filter.sensor, 0).noise, None, at(filter.channel, 0), True)
     return over_time(
-        [received_noise(at(item.sensor, k).noise, None, at(item.channel, k), True) for k in range(max(steps))]
+        [received_noise(at(filter.sensor, k).noise, None, at(filter.channel, k), True) for k in range(max(steps))]
     )

@@ -76,15 +76,15 @@ class PredictsByTransform(Protocol):
 
 
 def moments_around(
-    item: PredictsByTransform,
+    filter: PredictsByTransform,
     step: StepTrace,
     whole: Callable[[PyTree], Belief] | None = None,
 ) -> MomentsSmootherStep:
     """Smoother step by the moments around an update; `whole` reads them off a state that has others than its own."""
-    plant, read = at(item.plant, step.k), whole or (lambda state: Belief(state.mean, state.covariance))
+    plant, read = at(filter.plant, step.k), whole or (lambda state: Belief(state.mean, state.covariance))
     before, prior, after = map(read, step[:3])
-    cross = predicted(plant, item.transform, before, jnp.asarray(step.u)).cross
-    return moments_smoother_step(after, prior, cross, item.claim, plant.angles)
+    cross = predicted(plant, filter.transform, before, jnp.asarray(step.u)).cross
+    return moments_smoother_step(after, prior, cross, filter.claim, plant.angles)
 
 
 def prior_of(
@@ -128,8 +128,8 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = check_plant(plant)
-    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
-    claim: Claim = "exact" if isinstance(start, LinearPlant) and not own_prior and not start.circular else "nominal"
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
+    claim: Claim = "exact" if isinstance(start, LinearPlant) and not prior_given and not start.circular else "nominal"
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects, sized
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -63,7 +63,8 @@ class GaussianFilter(AbstractBeliefFilter):
         plant, sensor, channel = at((self.plant, self.sensor, self.channel), step.k)
         u = jnp.asarray(step.u)
         output = observed_through(channel.mean_gain, sensor.matrix)
-        return linear_smoother_step(step, (plant.transition_matrix(u), plant.noise_covariance(u), output), self.claim)
+        model = plant.transition_matrix(u), plant.noise_covariance(u), output
+        return linear_smoother_step(step, model, state_rounding(initial_size(self)), self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""
@@ -124,10 +125,15 @@ def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime
     return result
 
 
+def perfect_for(sensor: AnySensor) -> Channel:
+    """Return the channel that delivers all outputs of a sensor as they are."""
+    return perfect(len(instance("sensor", first(sensor), AbstractSensor, "a Sensor or LinearSensor").outputs))
+
+
 def _build(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: AbstractTransform,
     update: AbstractUpdate,
     initial_mean: ArrayLike | None,
@@ -137,9 +143,10 @@ def _build(
     # Checks, and the prior.
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
+    channel = perfect_for(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
-    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     # Moments of the channel, its memory ignored.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
@@ -149,7 +156,7 @@ def _build(
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     proved: Claim = "upper" if is_bounded(plant, sensor, channel) else "exact"
-    claim = proved if linear and trusted and not own_prior else "nominal"
+    claim = proved if linear and trusted and not prior_given else "nominal"
     return GaussianFilter(
         plant=plant,
         sensor=sensor,
@@ -167,7 +174,7 @@ def _build(
 def gaussian_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None,
     transform: "AbstractTransform",
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
@@ -178,8 +185,8 @@ def gaussian_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, None for one that delivers everything as it is. The memory of a
+            channel is ignored: where it matters, the claim is nominal.
         transform: moments of a nonlinear function; a linear plant or sensor needs none.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
@@ -202,7 +209,7 @@ def gaussian_filter(
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -212,8 +219,8 @@ def cubature_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored: where it matters, the claim is
-            nominal.
+        channel: from the sensor to the filter, by default all arrives as it is. The memory of a channel
+            is ignored: where it matters, the claim is nominal.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -232,7 +239,7 @@ def cubature_filter(
 def extended_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: Channel,
+    channel: Channel | None = None,
     update: "AbstractUpdate | None" = None,
     initial_mean: Float[ArrayLike, " n"] | None = None,
     initial_covariance: Float[ArrayLike, "n n"] | None = None,
@@ -242,7 +249,7 @@ def extended_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter.
+        channel: from the sensor to the filter; by default all arrives as it is.
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
@@ -313,5 +320,4 @@ def kalman_filter(
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{MATRICES}", got)
-    channel = perfect(len(first(sensor).outputs))
-    return gaussian_filter(plant, sensor, channel, Linearization(), None, initial_mean, initial_covariance)
+    return gaussian_filter(plant, sensor, None, Linearization(), None, initial_mean, initial_covariance)

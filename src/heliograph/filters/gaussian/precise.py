@@ -58,8 +58,8 @@ def precise_update(
     corrects that, or it would grow, step by step, where P says that the state is known. The prior itself is known to
     eps |P|, with which P+ is eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a
     variance, as where a wide prior or a singular noise ties states together to the last digit, it has no digits, and
-    so much is added to it, which is no less than what this gain leaves. Where no more is left than the square of the
-    mean's own rounding, as of tied states behind a noise-free output, the state is known.
+    so much is added to it, which is no less than what this gain leaves. So too where nothing is left, as of tied states
+    behind a noise-free output: whether they are tied or all but so, such a P does not say.
 
     Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
     Filtering for stochastic processes (1968).
@@ -77,8 +77,7 @@ def precise_update(
     gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise)
     remaining = jnp.asarray(identity(n, gain)) - times(gain, output)
-    of_data = times_vector(gain * gain, rounded)
-    return times(taken.whole, turn), after + diagonal(_lost(prior, start, remaining, after, of_data))
+    return times(taken.whole, turn), after + diagonal(_lost(prior, remaining, after))
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
@@ -101,14 +100,11 @@ def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[
     return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, least)
 
 
-def _lost(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array, of_data: jax.Array) -> jax.Array:
-    """A hundred times eps |I - K H| |P| |I - K H|' where less is left of a variance, but for rounding of mean and z."""
-    n, eps = len(prior), float(np.finfo(prior.dtype).eps)
-    remaining, left = jnp.abs(remaining), diagonal_of(after)
-    lost, reach = LEFT * eps * summed(times(remaining, jnp.abs(prior)) * remaining, 1), times(remaining, jnp.abs(start))
-    of_mean = summed(reach * reach, 1) + diagonal_of(prior)
-    known = 16 * (((n + 2) * eps) ** 2 * of_mean + of_data)
-    return jnp.where((lost <= left) | (left <= known), 0.0, lost)
+def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
+    """A hundred times eps |I - K H| |P| |I - K H|' where less is left of a variance."""
+    eps, remaining = float(np.finfo(prior.dtype).eps), jnp.abs(remaining)
+    lost = LEFT * eps * summed(times(remaining, jnp.abs(prior)) * remaining, 1)
+    return jnp.where(lost <= diagonal_of(after), 0.0, lost)
 
 
 class _Taken(NamedTuple):
@@ -123,26 +119,29 @@ class _Taken(NamedTuple):
     whole: jax.Array
 
 
-def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
+def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     """Roots and gains with one component more."""
     before, rounded, gain, whole = state
-    f = times_vector(transpose(before), item.row)
-    total = summed(f * f, 0) + item.variance
-    used = total > item.least
+    f = times_vector(transpose(before), component.row)
+    total = summed(f * f, 0) + component.variance
+    used = total > component.least
     safe = jnp.where(used, total, 1.0)
     shared = times_vector(before, f)
     column = jnp.where(used, shared / safe, 0.0)
-    noisy = item.variance > 0
-    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * item.variance, 1.0)), 0.0)
+    noisy = component.variance > 0
+    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * component.variance, 1.0)), 0.0)
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
-    news = item.number - times_vector(transpose(gain), item.row)
+    news = component.number - times_vector(transpose(gain), component.row)
     # A component of which P leaves nothing unknown corrects the mean's rounding, by the root of that alone.
-    g, reach = times_vector(transpose(rounded), item.row), times_vector(transpose(jnp.abs(rounded)), item.size)
+    g, reach = (
+        times_vector(transpose(rounded), component.row),
+        times_vector(transpose(jnp.abs(rounded)), component.size),
+    )
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
     corrects = ~used & (size > least)
     step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size, 1.0), column)
     rounded = rounded - step[:, None] * g[None]
-    whole = whole + step[:, None] * (item.number - times_vector(transpose(whole), item.row))[None]
+    whole = whole + step[:, None] * (component.number - times_vector(transpose(whole), component.row))[None]
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
 
 
@@ -158,6 +157,12 @@ def initial_size(item: HasStart) -> Float[jax.Array, " n"]:
     mean = jnp.asarray(item.initial_mean)
     seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(item.initial_covariance))
     return seconds
+
+
+def state_rounding(size: Array) -> Float[jax.Array, "n *runs"]:
+    """Variance of each component of a mean by rounding alone, ((n + 2) eps)^2 E[x_i^2] of the state at the start."""
+    unit = (len(size) + 2) * float(np.finfo(size.dtype).eps)
+    return unit**2 * jnp.asarray(size)
 
 
 def output_rounding(matrix: Array, size: Array) -> Float[jax.Array, " m"]:
@@ -181,7 +186,6 @@ def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array) -> jax.A
 
     Shapes: after and prior (n, n), size (n,).
     """
-    unit = (len(after) + 2) * float(np.finfo(after.dtype).eps)
     left, whole = diagonal_of(after), diagonal_of(prior)
     precise = left < rounding(PRECISE, after, 1000) * whole
-    return after + diagonal(jnp.where(precise, jnp.minimum(unit**2 * size, whole), 0.0))
+    return after + diagonal(jnp.where(precise, jnp.minimum(state_rounding(size), whole), 0.0))

@@ -105,14 +105,14 @@ def _received(
 
 
 def _innovation(
-    before: Expected, z: jax.Array, center: jax.Array, noise: jax.Array, after: Corrected, own_density: bool = False
+    before: Expected, z: jax.Array, center: jax.Array, noise: jax.Array, after: Corrected, by_law: bool = False
 ) -> Innovation:
     """Innovation about the noise's mean with the covariance that the law says; the score's density is the mixture's."""
     present = ~jnp.isnan(z)
     expected = before.signal + center
     value, covariance = z - expected, before.spread + noise
     both = present[:, None] & present[None]
-    density = after.log_density if own_density else log_density(value, covariance, jnp.abs(z) + jnp.abs(expected))
+    density = after.log_density if by_law else log_density(value, covariance, jnp.abs(z) + jnp.abs(expected))
     return Innovation(value, jnp.where(both, covariance, jnp.nan), density, after.weight)
 
 

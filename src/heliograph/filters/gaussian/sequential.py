@@ -44,7 +44,9 @@ class SequentialFilter(AbstractSizedFilter):
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Correct with each node's measurement in turn."""
         z = jnp.asarray(z)
-        if all(alike(item, self.filters[0]) for item in self.filters):  # one correction compiled, run over the nodes
+        if all(
+            alike(filter, self.filters[0]) for filter in self.filters
+        ):  # one correction compiled, run over the nodes
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
             def correct(belief: Belief, item: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:

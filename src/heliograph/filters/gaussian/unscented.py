@@ -84,11 +84,11 @@ class Unscented(AbstractTransform):
 def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    channel: "Channel",
+    channel: "Channel|None" = None,
     alpha: float = 1e-3,
-    beta: float = 2.0,
-    kappa: float = 0.0,
-    update: "AbstractUpdate | None" = None,
+    beta: float = 2,
+    kappa: float = 0,
+    update: "AbstractUpdate|None" = None,
     initial_mean: "Float[ArrayLike, ' n'] | None" = None,
     initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
 ) -> "GaussianFilter":
@@ -100,7 +100,7 @@ def unscented_filter(
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
-        channel: from the sensor to the filter. The memory of a channel is ignored.
+        channel: from the sensor to the filter; by default all arrives as it is. The memory of a channel is ignored.
         alpha: spread of the points, above 0.
         beta: weight of the mean's curvature, 2 for a Gaussian state.
         kappa: second spread; alpha^2 kappa + beta n may not be negative.

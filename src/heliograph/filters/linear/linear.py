@@ -13,7 +13,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import corrected, describe
-from heliograph.filters.gaussian.precise import initial_size
+from heliograph.filters.gaussian.precise import initial_size, state_rounding
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.modes.modal import modal_filter
@@ -114,7 +114,8 @@ class LinearFilter(AbstractSizedFilter):
             step = step._replace(innovation=replace(step.innovation, covariance=total))
         # F = A, process noise Q, H = M C.
         output = observed_through(channel.mean_gain, sensor.matrix)
-        return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), self.claim)
+        rounded = state_rounding(initial_size(at(self.plant, 0)))
+        return linear_smoother_step(step, (transition, plant.noise_covariance(u), output), rounded, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

@@ -125,15 +125,15 @@ def plan(
 
 
 @compiled
-def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
     # Complete data of zeros: the matrices do not depend on their values.
-    quiet = jnp.zeros(item.received)
+    quiet = jnp.zeros(filter.received)
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
-        single, prior, after = followed(item, state, quiet, row[1], row[0])
+        single, prior, after = followed(filter, state, quiet, row[1], row[0])
         return after, (single, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
 
-    start = item.init()
+    start = filter.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
     # Covariances in the order of `PlannedMean.stage`.
@@ -144,22 +144,22 @@ def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> Plan
         covariances=known,
         start=start.mean,
         projection=projection,
-        **sized(item.claim, item, item.received),
+        **sized(filter.claim, filter, filter.received),
     )
 
 
-def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
+def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
     """Matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     # F and f: the prior mean is affine in the mean.
     none = jnp.zeros_like(state.mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
-        prior = item.predict(state._replace(mean=mean), u, k)
+        prior = filter.predict(state._replace(mean=mean), u, k)
         return jnp.asarray(prior.mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
     # K and C: derivatives of posterior mean and innovation.
-    (_, gain), (output, _), after, innovation = _corrected(item, prior, none, z, k)
+    (_, gain), (output, _), after, innovation = _corrected(filter, prior, none, z, k)
     single = Plan(
         transition=transition,
         drift=jnp.asarray(prior.mean),
@@ -172,27 +172,27 @@ def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k:
 
 
 def _corrected(
-    item: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
+    filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
     """Derivatives of the corrected mean and of the innovation, each by prior mean and by z, and both themselves."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
-        after, innovation = item.correct(prior._replace(mean=mean), z, k)
+        after, innovation = filter.correct(prior._replace(mean=mean), z, k)
         return (jnp.asarray(after.mean), jnp.asarray(innovation.value)), (after, innovation)
 
     (of_mean, of_innovation), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
     return of_mean, of_innovation, after, received
 
 
-def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
+def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
     """Matrices of one step of a filter of which only the mean depends on data; of z only the gaps matter.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
-    if isinstance(item, PlannedFilter):
-        outcome: Plan = at(item.steps, k)
+    if isinstance(filter, PlannedFilter):
+        outcome: Plan = at(filter.steps, k)
         return outcome
-    single, _, _ = followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    single, _, _ = followed(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
     return single._replace(
         gain=jnp.where(present, single.gain, 0.0),
@@ -213,22 +213,22 @@ class Linearised(NamedTuple):
     noise: jax.Array
 
 
-def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+def linearised_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
     """Linearise a filter's correction at its prediction, with its covariance held.
 
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
     """
-    prior = item.predict(state, u, k)
-    (_, gain), (output, _), _, innovation = _corrected(item, prior, jnp.asarray(prior.mean), z, k)
+    prior = filter.predict(state, u, k)
+    (_, gain), (output, _), _, innovation = _corrected(filter, prior, jnp.asarray(prior.mean), z, k)
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
     return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
 
 
-def is_linear_filter(item: AbstractFilter) -> bool:
+def is_linear_filter(filter: AbstractFilter) -> bool:
     """Test whether only the mean of the filter depends on data, and estimates the plant's state alone."""
-    leaves, tree = jax.tree.flatten(item)
+    leaves, tree = jax.tree.flatten(filter)
     return _is_linear(tree, tuple(map(_shape, leaves)))
 
 

@@ -251,7 +251,7 @@ def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: Lin
     """Test whether the matrices of a time-invariant model have reached a steady state, to rounding."""
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
-    return all(np.allclose(part[-1], part[-2], rtol=1e-12, atol=0) for part in system.steps)
+    return all(np.allclose(step[-1], step[-2], rtol=1e-12, atol=0) for step in system.steps)
 
 
 def scheduled_polynomial_filter(

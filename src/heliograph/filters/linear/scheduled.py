@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
-from heliograph.filters.gaussian.precise import above_rounding
+from heliograph.filters.gaussian.precise import above_rounding, state_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -177,7 +177,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         # K' = S^+ C P, since S may be singular; the covariance in Joseph form.
         solved = pseudo_solve(used, cross)
         left = covariance_after(spread, cross, used, solved, observed, noise)
-        left = above_rounding(left, spread, jnp.asarray(self.mean) ** 2 + jnp.diag(jnp.asarray(self.covariance)))
+        left = above_rounding(left, spread, self._size())
         after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 
@@ -194,7 +194,12 @@ class LinearSystemFilter(AbstractSizedFilter):
         total = s.output @ step.prior.covariance @ s.output.T + s.noise
         step = step._replace(innovation=Innovation(residual, total, jnp.zeros(())))
         model = s.transition, s.process, s.output
-        return linear_smoother_step(step, model, self.claim, self.projection, pseudo_solve)
+        rounded = state_rounding(self._size())
+        return linear_smoother_step(step, model, rounded, self.claim, self.projection, pseudo_solve)
+
+    def _size(self) -> jax.Array:
+        """E[y_i^2] at the start, (N,)."""
+        return jnp.asarray(self.mean) ** 2 + jnp.diag(jnp.asarray(self.covariance))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""

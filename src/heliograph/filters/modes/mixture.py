@@ -47,29 +47,29 @@ class Component(NamedTuple):
     noise: np.ndarray
 
 
-def atoms_of(item: AbstractRandomAffine) -> list[Component]:
+def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
     """All combinations of the atoms of a map's gains and noises."""
-    match item:
+    match channel:
         # z = g H y + n: every gain with every noise.
         case GainAndNoise():
-            gains, noises = _gain_atoms(item.law), _noise_atoms(item.noise)
-            result = [Component(p * q, g * np.asarray(item.matrix), c, r) for p, g in gains for q, c, r in noises]
+            gains, noises = _gain_atoms(channel.law), _noise_atoms(channel.noise)
+            result = [Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises]
         # One map after another: G_2 (G_1 y + n_1) + n_2.
         case Series():
-            result = atoms_of(item.maps[0])
-            for part in item.maps[1:]:
+            result = atoms_of(channel.maps[0])
+            for part in channel.maps[1:]:
                 result = _combine(result, atoms_of(part), _after)
         # Maps of the same signal, stacked.
         case Stack():
-            result = atoms_of(item.maps[0])
-            for part in item.maps[1:]:
+            result = atoms_of(channel.maps[0])
+            for part in channel.maps[1:]:
                 result = _combine(result, atoms_of(part), _others)
         # One of several maps, drawn: p(i) times the atoms of map i.
         case Mixture():
-            weighted = zip(item.choice.probabilities, item.maps, strict=True)
+            weighted = zip(channel.choice.probabilities, channel.maps, strict=True)
             result = [c._replace(weight=p * c.weight) for p, part in weighted for c in atoms_of(part)]
         case _:
-            raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(item).__name__)
+            raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(channel).__name__)
     return result
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
-from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding
+from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -165,7 +165,9 @@ class ModalFilter(AbstractModalFilter):
         output = self._observe(step.prior, step.k)[0]
         transition, move, noise, _, rows = self._moves(step.before, step.u, step.k)
         process = _spread_of_moves(step.before.moments, move, noise, rows)[1]
-        return linear_smoother_step(step, (transition, process, output), self.claim, self._projection())
+        size = jnp.append(initial_size(at(self.plant, 0)), 1.0)
+        rounded = state_rounding(jnp.kron(step.prior.moments[:, -1, -1], size))
+        return linear_smoother_step(step, (transition, process, output), rounded, self.claim, self._projection())
 
 
 def _spread_of_moves(

@@ -173,12 +173,13 @@ class Adjoint(NamedTuple):
 class LinearSmootherStep(AbstractSmootherStep):
     """A linear update: y- = A y + ..., y = y- + K e, e = z - H y- - ..., K = P- H' S^-1, nothing else inverted.
 
-    Moments before the correction, transition A, process Q, gain K, output H, weigh H' S^-1, innovation e; zero for what
-    did not arrive. With B = I - K H, lambda- = B' lambda - H' S^-1 e and
+    Moments before the correction, transition A, process Q (with the rounding of y), gain K, output H, weigh H' S^-1,
+    innovation e; zero for what did not arrive. With B = I - K H, lambda- = B' lambda - H' S^-1 e and
     Lambda- = B' Lambda B + H' S^-1 H, then both through A'.
 
     precise: whether the noise of z is far below S. From such an update back, states are smoothed as Rauch, Tung and
-    Striebel do, by J = P A' (P-)^+, which divides no innovation.
+    Striebel do, by J = P A' (P-)^+, which divides no innovation. To such a J rounding is noise of the process: without
+    it a Q of zero says that y+ = A y to the last digit, J goes to A^-1, and that takes rounding for news.
 
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
     """
@@ -215,9 +216,7 @@ class LinearSmootherStep(AbstractSmootherStep):
 
         Source: Rauch, Solutions to the linear smoothing problem (1963).
         """
-        link, apart = _point_moved(
-            point.link, point.apart, covariance, self.transition, self.prior_covariance, self.process
-        )
+        link, apart = _point_moved(point.link, point.apart, covariance, self.transition, self.process)
         news = self.mean - self.prior_mean
         squares = _point_from(point.mean, link, apart, news, self.covariance)
         step = self.transition, self.gain, self.output, self.weigh, self.innovation
@@ -232,9 +231,9 @@ class LinearSmootherStep(AbstractSmootherStep):
         x + J (x_s+ - x-) and P_s = (I - J A) P (I - J A)' + J (Q + P_s+) J', a sum of squares by Rauch, Tung and
         Striebel with P - J P- J' in Joseph's form; it needs one more inverse.
         """
-        step = item.covariance, self.transition, self.prior_covariance, earlier.precise
+        step = item.covariance, self.transition, self.process, earlier.precise
         mean = _mean_before(item.mean, earlier.vector, known.mean - self.prior_mean, *step)
-        return Moments(mean, _left(earlier.matrix, self.process, known.covariance, *step))
+        return Moments(mean, _left(earlier.matrix, known.covariance, *step))
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:
         """Return the step with these means and innovation."""
@@ -283,9 +282,9 @@ def _point_ahead(
 
 @runs_last
 def _point_moved(
-    link: jax.Array, apart: jax.Array, p: jax.Array, transition: jax.Array, prior: jax.Array, process: jax.Array
+    link: jax.Array, apart: jax.Array, p: jax.Array, transition: jax.Array, process: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    moved = times(link, _smoother_gain(p, transition, prior))
+    moved = times(link, _smoother_gain(p, transition, process))
     left = link - times(moved, transition)
     return moved, apart + spread_of(left, p) + spread_of(moved, process)
 
@@ -297,9 +296,11 @@ def _point_from(
     return mean + times_vector(link, news), symmetric(apart + spread_of(link, posterior))
 
 
-def _smoother_gain(p: jax.Array, transition: jax.Array, prior: jax.Array) -> jax.Array:
-    """J = P A' (P-)^+."""
-    return transpose(solve(prior, times(transition, p)))
+def _smoother_gain(p: jax.Array, transition: jax.Array, process: jax.Array) -> jax.Array:
+    """J = P A' (P-)^+ with P- = A P A' + Q."""
+    moved = times(transition, p)
+    prior = symmetric(times(moved, transpose(transition)) + process)
+    return transpose(solve(prior, moved))
 
 
 def _mean_before_by(
@@ -309,12 +310,12 @@ def _mean_before_by(
     news: jax.Array,
     p: jax.Array,
     transition: jax.Array,
-    prior: jax.Array,
+    process: jax.Array,
     precise: jax.Array,
 ) -> jax.Array:
     return pick(
         precise,
-        lambda: mean + times_vector(_smoother_gain(p, transition, prior), news),
+        lambda: mean + times_vector(_smoother_gain(p, transition, process), news),
         lambda: mean - times_vector(p, vector),
     )
 
@@ -325,18 +326,17 @@ _mean_before = runs_last(partial(_mean_before_by, where_any), partial(_mean_befo
 def _left_by(
     pick: Pick,
     matrix: jax.Array,
-    process: jax.Array,
     later: jax.Array,
     p: jax.Array,
     transition: jax.Array,
-    prior: jax.Array,
+    process: jax.Array,
     precise: jax.Array,
 ) -> jax.Array:
     half = times(p, matrix)
     sharp = jnp.any(diagonal_of(p) - summed(half * p, 1) < SHARP * diagonal_of(p), axis=0)
     return pick(
         sharp | precise,
-        lambda: sum_of_squares(p, root(p), _smoother_gain(p, transition, prior), transition, process + later),
+        lambda: sum_of_squares(p, root(p), _smoother_gain(p, transition, process), transition, process + later),
         lambda: symmetric(with_rounding(p, len(p)) - times(half, p)),
     )
 

@@ -110,12 +110,14 @@ def moments_smoother_step(
 def linear_smoother_step(
     step: StepTrace,
     model: tuple[Array, Array, Array],
+    rounded: Array,
     claim: Claim,
     projection: Array | None = None,
     solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> LinearSmootherStep:
     """Build the step from the states around a correction, its innovation e and S, and A, Q and H of the `model`.
 
+    `rounded`: variance of each component of a mean by rounding alone (N,), a part of the process.
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
     component that others determine is left out.
     """
@@ -135,7 +137,7 @@ def linear_smoother_step(
         prior_covariance=spread,
         precise=_precise(spread, received, arrived),
         transition=transition,
-        process=process,
+        process=process + jnp.diag(rounded),
         gain=gain,
         output=received,
         weigh=weigh,

@@ -75,6 +75,7 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
     Raises:
         ValueError: neither of them, names that are no texts, a node as its own neighbour, or one twice.
     """
+    # Edges of a networkx graph, in both directions where it has none.
     if isinstance(value, GraphLike):
         pairs = [tuple(pair[:2]) for pair in value.edges()]
         both = pairs if value.is_directed() else [*pairs, *(pair[::-1] for pair in pairs)]
@@ -95,6 +96,7 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
         if len(set(mine)) < len(mine):
             twice = sorted({sender for sender in mine if mine.count(sender) > 1})
             raise fail(f"neighbours of {name!r}", "each once", f"{twice} more than once")
+    # Senders that no entry names.
     for sender in {sender: None for mine in results.values() for sender in mine}:
         results.setdefault(sender, ())
     if not results:

@@ -214,7 +214,7 @@ def sole_filter(network: Network) -> AbstractFilter:
     """
     nodes = list(network.nodes.values())
     local = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
-    items = [*local.values(), *(item for item in network.fused.values() if isinstance(item, AbstractFilter))]
+    items = [*local.values(), *(fusion for fusion in network.fused.values() if isinstance(fusion, AbstractFilter))]
     if len(items) != 1 or items[0].states != network.states:
         expected = "one filter, of all that arrives, whose estimates are compared with them"
         raise fail("network to be learned by its true states", expected, len(items) or "none")
@@ -227,7 +227,7 @@ def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data
     """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
     data_rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
     count, copies = len(data.measurements), (len(x), 1, 1)
-    runs = np.repeat(x, count, axis=0), *(np.tile(part, copies) for part in data_rows)
+    runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)
     with jax.enable_x64(True):
         choice = chosen(one_recording, (objective, *runs), [False, *(True for _ in runs)])
         if choice.code is not None:
@@ -358,8 +358,8 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         columns: list[np.ndarray] = []
         for name, z in zip(network.names, run, strict=True):
             like = len(columns[0]) if columns else None
-            found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
-            columns.append(np.asarray(found_rows))
+            measured = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(measured))
         steps, count = len(columns[0]), len(network.inputs)
         if local is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")

@@ -188,19 +188,19 @@ def _part(components: list[Component]) -> Part:
 
 @compiled
 def expected_signals(
-    item: GaussianFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+    filter: GaussianFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (angles near them)."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, ...]]:
         k, z_k, u_k = row
-        prior = item.predict(state, u_k, k)
-        plant, sensor, channel = at((item.plant, item.sensor, item.channel), k)
-        y = signal_of(plant, sensor, item.transform, prior)
-        near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, item.observed_angles)
-        return item.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
+        prior = filter.predict(state, u_k, k)
+        plant, sensor, channel = at((filter.plant, filter.sensor, filter.channel), k)
+        y = signal_of(plant, sensor, filter.transform, prior)
+        near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, filter.observed_angles)
+        return filter.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
-    start = jax.tree.map(jnp.asarray, item.init())
+    start = jax.tree.map(jnp.asarray, filter.init())
     result: tuple[jax.Array, ...] = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
     return result[0], result[1], result[2]
 

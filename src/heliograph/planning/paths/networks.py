@@ -49,6 +49,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
         raise _unfit("nodes that share a channel (give a function of free numbers)")
+    # Second moments of the plant at each step, or in its steady state.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
@@ -123,6 +124,7 @@ def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefi
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:
             moved = moved or bool(np.any(np.asarray(part.noise.mean)))
+    # Fading multiplies the last hop.
     if hops:
         last = list(hops)[-1]
         hops[last] = (hops[last][0] * fading, hops[last][1])
@@ -131,25 +133,25 @@ def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefi
     return Chain(row, hops)
 
 
-def _hop(part: GainAndNoise) -> tuple[float, float]:
+def _hop(hop: GainAndNoise) -> tuple[float, float]:
     """kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
-    if len(part.law.extremes()) > 1:
+    if len(hop.law.extremes()) > 1:
         raise _unfit("a gain with uncertain probabilities")
-    mean, square = float(part.law.moment(1)), float(part.law.moment(2))
+    mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
     if mean == 0:
         raise fail("hop", "a gain whose mean is not zero (a linear filter receives no signal else)", "mean 0")
-    if np.any(np.asarray(part.noise.mean)):
+    if np.any(np.asarray(hop.noise.mean)):
         raise _unfit("noise with a mean")
-    return square / mean**2, float(np.asarray(part.noise.covariance)[0, 0]) / square
+    return square / mean**2, float(np.asarray(hop.noise.covariance)[0, 0]) / square
 
 
-def _loss(part: Mixture) -> tuple[AbstractRandomAffine, float]:
+def _loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
     """Channel behind an unobserved loss, and 1 / (arrival probability)."""
-    p = np.asarray(part.choice.probabilities)
-    silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in part.maps]
-    if silent.count(False) != 1 or part.corner_count() > 1 or not (arrival := float(p[silent.index(False)])) > 0:
+    p = np.asarray(mixture.choice.probabilities)
+    silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in mixture.maps]
+    if silent.count(False) != 1 or mixture.corner_count() > 1 or not (arrival := float(p[silent.index(False)])) > 0:
         raise _unfit("a mixture of several channels")
-    return part.maps[silent.index(False)], 1 / arrival
+    return mixture.maps[silent.index(False)], 1 / arrival
 
 
 def _unfit(got: str) -> ValueError:

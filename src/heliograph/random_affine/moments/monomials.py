@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from heliograph.numerics.caching import cached_arrays
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import placed
@@ -66,7 +67,7 @@ def monomials(y: Numbers, degree: int) -> Numbers:
     return jnp.stack([jnp.asarray(t, dtype=float) for t in terms])
 
 
-@cache
+@cached_arrays
 def _raise_table(variables: int, degree: int) -> np.ndarray:
     """Entry (i, c): position at degree - 1 of monomial i divided by variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
@@ -78,7 +79,7 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
     return table
 
 
-@cache
+@cached_arrays
 def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
     table = _raise_table(variables, degree)
@@ -113,7 +114,7 @@ def _append_zero_column(a: Numbers) -> Numbers:
     return jnp.pad(a, ((0, 0), (0, 1)))
 
 
-@cache
+@cached_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
     target = position(variables, first + second)
@@ -130,13 +131,13 @@ def multiply(a: Numbers, first: int, b: Numbers, second: int, variables: int) ->
     return placed((count(variables, first + second),), product_table(variables, first, second), terms)
 
 
-@cache
+@cached_arrays
 def degrees(dimension: int, order: int) -> np.ndarray:
     """Degree of each monomial in the variables other than 1."""
     return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
 
 
-@cache
+@cached_arrays
 def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
     places, terms = position(dimension + 1, order), []
@@ -179,7 +180,7 @@ class Moments(Module):
         return self.matrix @ y_moments
 
 
-@cache
+@cached_arrays
 def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
     """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
     items = [

@@ -4,13 +4,14 @@ A lift of degree d needs moments of order 2 d, but only as one vector: what is p
 largest matrix that a known matrix A needs is Sym^(k/2)(A).
 """
 
-from functools import cache, reduce, singledispatch
+from functools import reduce, singledispatch
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.caching import cached_arrays
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, plain, stacked
 from heliograph.numerics.types import Float
@@ -109,7 +110,7 @@ def _(noise: Tabulated, order: int) -> Array1:
     return noise.table[_lower(noise.dimension, order, noise.order)]
 
 
-@cache
+@cached_arrays
 def _lower(dimension: int, order: int, above: int) -> np.ndarray:
     """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
     places = position(dimension + 1, above)
@@ -132,7 +133,7 @@ def _checked(channel: AbstractRandomAffine, order: int, moments: Array1) -> Arra
     return moments
 
 
-@cache
+@cached_arrays
 def _one_place(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)

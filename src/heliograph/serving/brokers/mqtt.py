@@ -11,7 +11,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, LONGEST, WHOLE, Batch, Part, word
+from heliograph.serving.brokers.transport import LOG, LONGEST, WHOLE, Batch, Part, topic_of
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -172,8 +172,8 @@ class _Writer(_Connection):
         """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
         sent = set()
         for output in outputs:
-            topic = f"{self.address.topic}/out/{output.kind}/{word(output.plant)}"
-            item = self.client.publish(topic, output.body, 0 if output.number is None else AT_LEAST_ONCE)
+            quality = 0 if output.kind == "provisional" else AT_LEAST_ONCE
+            item = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:
                 sent.add(item.mid)
         with self.room:

@@ -24,7 +24,7 @@ from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import WHOLE, Batch, Part, Retry, TakenOverError, still_needed, word
+from heliograph.serving.brokers.transport import WHOLE, Batch, Part, Retry, TakenOverError, still_needed, topic_of
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -113,10 +113,10 @@ class Nats:
                 await asyncio.wait_for(self._client.close(), WAIT)
 
     async def _tell(self, outputs: Sequence[Output]) -> None:
-        """Publish provisional estimates without storage; store outputs that have a number, without duplicates."""
+        """Publish what has no number as it comes; store outputs that have one, without duplicates."""
         server, stored = await self._open(), []
         for output in outputs:
-            subject = f"{self.topic}.out.{output.kind}.{word(output.plant)}"
+            subject = topic_of(self.address.topic, output).replace("/", ".")
             if output.number is None:
                 await self._client.publish(subject, output.body)
             else:

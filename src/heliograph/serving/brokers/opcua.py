@@ -92,6 +92,7 @@ async def reporting_of(node: Node) -> Reporting:
         deviation = await _property(place, "ExceptionDeviation")
         if deviation is None:
             continue
+        # Absolute, or a share of the variable's range.
         kind = await _property(place, "ExceptionDeviationFormat")
         bounds = await _property(node, "EURange")
         if kind in (None, ABSOLUTE):

@@ -134,6 +134,13 @@ def word(plant: str) -> str:
     return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
 
 
+def topic_of(topic: str, output: Output) -> str:
+    """Return the topic of an output of the service at `topic`; of a message to a node the input of its service."""
+    if output.kind == "message":
+        return "/".join([*topic.split("/")[:-1], word(output.to), "in", word(output.plant)])
+    return f"{topic}/out/{output.kind}/{word(output.plant)}"
+
+
 def part_of(plant: str, parts: int) -> int:
     """Return the part that a plant is in.
 

@@ -28,8 +28,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliograph.live.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
+from heliograph.serving.storage.carrier import DESCRIPTION, Carrier
 from heliograph.serving.storage.database import engine_at
-from heliograph.serving.storage.plant_codec import DESCRIPTION, Carrier
 from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
 
 LAYOUT = "3"  # of these tables; those of layout 1 had no checksums, of 2 no description of the network

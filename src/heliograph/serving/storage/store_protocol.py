@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
+from heliograph.live.fleet import Fleet
 from heliograph.live.snapshot import Identity, network_identity
 from heliograph.numerics.check import instance
-from heliograph.serving.fleet import Fleet
 from heliograph.serving.output import Kind, Output
-from heliograph.serving.storage.plant_codec import DESCRIPTION, description
+from heliograph.serving.storage.carrier import DESCRIPTION, description
 
 
 class StoredPlant(NamedTuple):
@@ -84,7 +84,7 @@ def identity(fleet: Fleet) -> Identity:
         fleet: the fleet whose plants the store keeps.
     """
     instance("fleet", fleet, Fleet, "a Fleet")
-    return network_identity(fleet.network, fleet.lanes.player.step_rows.program(), fleet.options._asdict()) | {
+    return network_identity(fleet.network, fleet.lanes.step_rows.program, fleet.options._asdict()) | {
         DESCRIPTION: description(fleet)
     }
 

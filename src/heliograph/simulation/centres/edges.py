@@ -57,6 +57,7 @@ class Edges(Module):
                     state, z = deliver(channel, state, sent, key, count, item.checksums, item.memories)
                     return state, ~jnp.any(jnp.isnan(z))
 
+                # All channels of one kind at once; their flags go to the places of the edges.
                 both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
                 state, arrives = both(group, state, k * self.rounds + number)
                 following.append(state)

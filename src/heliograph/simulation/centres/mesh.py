@@ -127,6 +127,7 @@ class Mesh(Module):
         for weights in parts.exchanges:
             mean = mean + self._pulled(weights.front, weights.parts, mean, mean[self.senders])
         sent = self._sent(mean, state, jnp.asarray(arrived[:, -1]))
+        mean = mean[self.senders[:, 0]]  # of the nodes that are stepped
         # Innovations about one common prediction, so that no digits of the means themselves are lost.
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)

@@ -110,6 +110,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     varying = [item for pair in observations for item in pair] + [network.plant]
     if any(isinstance(item, OverTime) for item in varying):
         return
+    # Matrices that do not vary.
     a = np.asarray(first(network.plant).matrix)
     n = len(a)
     refuse_angles(what, network.plant, *(sensor for sensor, _ in observations))
@@ -121,6 +122,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
             squares[i] = h.T @ h
             noise = np.asarray(first(item.sensor).noise.covariance)
             _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
+    # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
     unseen: dict[bool, list[str]] = {True: [], False: []}
     values = np.linalg.eigvals(a)
     checked: dict[int, set[bool]] = {}
@@ -129,6 +131,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
             checked[id(places)] = _unseen(a, values, squares[places].sum(axis=0))
         for unstable in checked[id(places)]:
             unseen[unstable].append(nodes[i])
+    # Unstable ones are refused, decaying ones warned of.
     if unseen[True]:
         some = ", ".join(map(repr, unseen[True][:5])) + (" and more" if len(unseen[True]) > 5 else "")
         raise fail(
@@ -155,6 +158,7 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
     # Capacities -log p in whole units; those that are never cut get more than all others together.
     exact = np.array([-np.log(max(1 - float(c or 0.0), 1e-300)) for c in chances])
     units = np.minimum(np.round(UNIT * exact), 1e8).astype(np.int32)
+    # Of each unstable mode the least cut between the nodes that observe it and each other node.
     values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
     for value, vector in zip(values, vectors.T, strict=True):
         if abs(value) <= 1 + MODE:

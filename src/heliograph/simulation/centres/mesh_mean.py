@@ -67,6 +67,7 @@ def mean_mesh_errors(
     if not (item.rule.needs_joint or isinstance(item.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
         raise fail(f"mean errors of fusion {fusion!r}", expected, type(item.rule).__name__)
+    # Probability of each pattern of arrivals.
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
@@ -80,6 +81,7 @@ def mean_mesh_errors(
     rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
+    # Joint errors, step after step, averaged over the patterns.
     joint, covariance, moments = np.tile(start.plant[1], (len(names),) * 2), start.covariance, start.plant
     errors = []
     for k, u_k in enumerate(u):

@@ -39,11 +39,11 @@ def diagram(network: "Network") -> list[Part]:
     parts += [Part(listed(names), words) for words, names in alike.items()]
     # Fused estimates, then what several nodes share.
     claims = network.claims().get("fused", {})
-    for name, item in network.fused.items():
-        if isinstance(item, AbstractFilter):
-            words = f"{type(item).__name__} of all measurements"
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):
+            words = f"{type(fusion).__name__} of all measurements"
         else:
-            words = f"{type(item.rule).__name__} of {item.filter!r} of {listed(network.nodes_with(item.filter))}"
+            words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {listed(network.nodes_with(fusion.filter))}"
         parts.append(Part(f"fused {name}", f"{words} ({claims[name]})"))
     parts += [Part("shared", words) for words in shared(network)]
     return [Part(visible(part.name), visible(part.words)) for part in parts]

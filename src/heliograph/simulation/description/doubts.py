@@ -141,7 +141,7 @@ def _forgotten(network: Network) -> Iterator[Doubt]:
         yield Doubt(True, f"{words}; linear_filter or mixture_filter of the link itself knows it")
 
 
-def _forgets(item: AbstractFilter) -> bool:
+def _forgets(filter: AbstractFilter) -> bool:
     """Return whether a filter, or the one that it wraps, has no model of memory."""
-    inner = getattr(item, "base", item)
+    inner = getattr(filter, "base", filter)
     return isinstance(inner, GaussianFilter | LinearFilter)

@@ -34,13 +34,14 @@ def _words(channel: AbstractRandomAffine) -> str:
         case Series():
             return ARROW.join(filter(None, map(_words, channel.maps)))
         case Stack():
-            parts = [_words(part) or DIRECT for part in channel.maps]
+            parts = [_words(affine) or DIRECT for affine in channel.maps]
             same = len(set(parts)) == 1
             return f"{len(parts)} × ({parts[0]})" if same else f"({' | '.join(parts)})"
         case Erasure():
             return f"{_words(channel.base) or DIRECT}, {_percent(1 - channel.arrival)} lost"
         case Mixture():
             return _mixture(channel)
+        # Links that deliver late, and those whose modes remember.
         case Delayed():
             late = "/".join(map(str, channel.times))
             stamped = ", timestamped" if channel.timestamped else ""
@@ -77,7 +78,7 @@ def _no_noise(noise: AbstractNoise) -> bool:
 
 def _mixture(channel: Mixture) -> str:
     """Return a mixture in words; of a channel and silence, as a loss that nobody notices."""
-    shares, parts = channel.choice.probabilities, [_words(part) or DIRECT for part in channel.maps]
+    shares, parts = channel.choice.probabilities, [_words(affine) or DIRECT for affine in channel.maps]
     if len(parts) == 2 and parts[1] == "nothing sent":
         return f"{parts[0]}, {_percent(shares[1])} lost unnoticed"
     return f"({' or '.join(f'{part} ({_percent(p)})' for part, p in zip(parts, shares, strict=True))})"

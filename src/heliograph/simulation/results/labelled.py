@@ -76,6 +76,7 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
     for (node, name, quantity), values in joined.items():
         if quantity in ("truth", "mean"):
             states = tuple(component for component, _ in parts[node, name, quantity])
+        # Columns of one node, of one uplink, or of one covariance.
         elif quantity == "measurement":
             measurements[node] = values
             estimates.setdefault(node, {})
@@ -85,6 +86,7 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
             n, mean = len(states), joined[node, name, "mean"]
             covariance = values.reshape(*lead, n, n)
             estimates.setdefault(node, {})[name] = Estimate(mean, covariance, COVARIANCE[quantity])
+    # Uplinks with their nodes side by side.
     uplinks = {
         name: Uplink(tuple(item), *(np.stack(item, axis=-2) for item in zip(*item.values(), strict=True)))
         for name, item in sent.items()

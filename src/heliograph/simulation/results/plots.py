@@ -68,11 +68,13 @@ def plot_statistics(
     drawn = _axes(axes, len(places), time, result.units)
     for single, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
+            # Solid: actual; dashed: claimed.
             item, colour = result[node][name], _colour(number)
             claimed = item.claimed()[:, i, i]
             single.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
             single.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
         single.set_ylabel(f"RMSE of {_with_unit(result.states[i], result.units)}")
+        # A log axis where one is far larger than another.
         ends = [float(np.sqrt(result[node][name].actual()[-1, i, i])) for name in filters]
         if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
             single.set_yscale("log")

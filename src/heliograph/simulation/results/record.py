@@ -107,7 +107,8 @@ class Record(Saved):
             measurements=measurements,
             estimates=estimates,
             uplinks={
-                name: Uplink(item.nodes, item.saturated[run], item.symbols[run]) for name, item in self.uplinks.items()
+                name: Uplink(uplink.nodes, uplink.saturated[run], uplink.symbols[run])
+                for name, uplink in self.uplinks.items()
             },
             smoothed=None if self.smoothed is None else self.smoothed.of_run(run),
             reports=reports,

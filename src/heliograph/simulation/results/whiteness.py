@@ -152,7 +152,7 @@ def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 @compiled
 def innovations_of(
-    item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+    filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
@@ -165,5 +165,5 @@ def innovations_of(
         white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
         return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)
 
-    likelihoods, white = over_rows(item, z, u, single)
+    likelihoods, white = over_rows(filter, z, u, single)
     return likelihoods, white

@@ -195,6 +195,7 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
             values.append(
                 array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], item.shape)
             )
+    # The program of one run.
     values.append(InMemory.whole(number))
     outputs = lowering.inline(made, values)
     return Program(graph, [*inputs, number], outputs, None)

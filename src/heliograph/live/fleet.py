@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.live.event import INPUTS, OF_STEPS, Known, Verdict
+from heliograph.live.lanes import Lanes
+from heliograph.live.plant import Plant
 from heliograph.live.pool import Pool
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
-from heliograph.serving.lanes import Lanes
-from heliograph.serving.plant import Plant
 from heliograph.simulation.node import Node
 
 FAR = 10_000  # steps that an event may be after the newest one: each of them has to be computed, while others wait
@@ -57,24 +57,25 @@ class Fleet:
     Args:
         lanes: the compiled step of the network.
         options: the limits of events and of memory.
+        alone: single rows are stepped, not those of many plants at once.
     """
 
-    def __init__(self, lanes: Lanes, options: Options):
+    def __init__(self, lanes: Lanes, options: Options, alone: bool = False):
         instance("lanes", lanes, Lanes, "Lanes")
         instance("options", options, Options, "Options")
         network = self.network = lanes.network
         self.options, self.lanes = _checked(options), lanes
-        self.pool = Pool(lanes.player)
-        # Columns of a row: the measurements of each node in turn, then the inputs.
-        self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
-        self._sizes[INPUTS] = -1, self.lanes.given
-        sizes = [size for _, size in self._sizes.values()]
+        self.pool = Pool(lanes, alone)
+        # Index and size of each node's measurement, and of the inputs; their columns in a row, in this order.
+        self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
+        self.sizes[INPUTS] = -1, self.lanes.given
+        sizes = [size for _, size in self.sizes.values()]
         self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
-        self._width = self._places[-1].stop
+        self.width = self._places[-1].stop
         # Last step for which the network is defined; limits of the jumps in time.
         covered = steps_covered(network)
-        self._end = np.inf if covered is None else covered - 1
-        self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
+        self.end_step = np.inf if covered is None else covered - 1
+        self._leap = options.leap if alone or self.lanes.dt is not None else min(options.leap, FAR)
         self._joint = self.lanes.dt is None or network.common is not None
         # Nodes whose sender decides when to send.
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
@@ -94,7 +95,7 @@ class Fleet:
         begun = -1.0 if self.lanes.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
-        base = HeldRow((begun, BEFORE, 0), slot, self._width)
+        base = HeldRow((begun, BEFORE, 0), slot, self.width)
         base.numbers[-1] = begun
         return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
 
@@ -113,15 +114,19 @@ class Fleet:
 
     def known(self, node: str, sequence: int, time: float, values: list[float | None], arrival: float) -> Known:
         """Convert an event to numbers."""
-        place, size = self._sizes.get(node, (0, -1))
+        place, size = self.sizes.get(node, (0, -1))
         if size < 0:
-            raise fail("message, node", f"one of {', '.join(self._sizes)}", repr(node)[:60])
+            raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
         if len(values) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
-        if self.lanes.dt is None and not (0 <= time <= self._end and time == int(time)):
-            end = "" if self._end == np.inf else f" to {self._end:g}"
-            raise fail("message, time", f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
+        self.check_step("message, time", time)
         return Known(place, sequence, time, np.array(values, dtype=np.float64), arrival)
+
+    def check_step(self, name: str, time: float) -> None:
+        """Refuse a time that is no step of the network, where time counts steps."""
+        if self.lanes.dt is None and not (0 <= time <= self.end_step and time == int(time)):
+            end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
+            raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
     def take(self, plant: Plant, event: Known) -> Verdict:
         """Judge an event and hold it if it is used."""
@@ -131,7 +136,7 @@ class Fleet:
         verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
         if verdict != "used":
             return verdict
-        plant.take(event, self.pool.take, self._width)
+        plant.take(event, self.pool.take, self.width)
         plant.now = now
         return verdict
 
@@ -154,8 +159,18 @@ class Fleet:
         for chain in chains:
             slots = [row.slot for row in chain]
             self.pool.table[slots, self.pool.numbers] = np.array([row.numbers for row in chain])
+        self._run(chains)
+
+    def _run(self, chains: Sequence[list[HeldRow]]) -> None:
+        """Step along chains of rows, whose numbers stand in the table, from the first of each."""
         for before, after, at in _rounds(chains, self.lanes.dt is None):
             self.pool.step(np.array(before), np.array(after), np.array(at))
+
+    def look(self, row: HeldRow, time: float, slot: int) -> None:
+        """Predict from a row to a later time, into a slot that no row has."""
+        there = HeldRow((float(time), 0, 0), slot, self.width)
+        self.pool.table[slot, self.pool.numbers] = there.numbers
+        self._run([[row, there]])
 
     def trial(
         self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
@@ -166,7 +181,7 @@ class Fleet:
         begun yet. An input that is NaN keeps its value.
         """
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
-        return self.pool.trial(np.array(slots), given, self._end)
+        return self.pool.trial(np.array(slots), given, self.end_step)
 
     def outputs(self, slots: list[int]) -> list[list[float]]:
         """Return the outputs of the filters after the rows in these slots."""
@@ -175,7 +190,7 @@ class Fleet:
 
     def senders(self, plant: Plant) -> dict[str, SenderStatus]:
         """Return the status of each sender of a plant that decides when to send: what its silence means by now."""
-        final, now = int(np.ceil(plant.now - self.options.window)) - 1, int(np.floor(min(plant.now, self._end)))
+        final, now = int(np.ceil(plant.now - self.options.window)) - 1, int(np.floor(min(plant.now, self.end_step)))
         links = {name: plant.links.get(name) for name in self.deciding}
         last = {
             name: int(link.latest) if link is not None and link.latest >= 0 else None for name, link in links.items()

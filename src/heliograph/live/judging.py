@@ -7,11 +7,11 @@ import numpy as np
 
 from heliograph.filters.plausibility import Judgement, why_inputs, why_values
 from heliograph.live.event import Known
+from heliograph.live.fleet import Fleet
+from heliograph.live.lanes import Place
+from heliograph.live.plant import Plant
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
-from heliograph.serving.fleet import Fleet
-from heliograph.serving.lanes import Place
-from heliograph.serving.plant import Plant
 from heliograph.simulation.network import FUSED
 
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
@@ -44,8 +44,11 @@ class Judges:
         """Explain which inputs are implausible, by the prediction over one step or unit of time that they lead to."""
         if not plants:
             return []
-        outputs = self.fleet.trial(plants, given)
-        return [why_inputs(row[self._every]) for row in outputs]
+        return [self.why_inputs(row) for row in self.fleet.trial(plants, given)]
+
+    def why_inputs(self, outputs: Float[np.ndarray, " outputs"]) -> str | None:
+        """Explain why the inputs that led to these outputs are implausible; None if they are not."""
+        return why_inputs(outputs[self._every])
 
     def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
         """Return the indices of the implausible candidates, each with the reason.
@@ -66,7 +69,7 @@ class Judges:
             item = taken[i]
             if item.event.place >= 0:
                 why = why_values(outputs[i][self._columns[item.event.place]]) if _size(item.event) >= 0 else None
-            elif why := why_inputs(outputs[i][self._every]):
+            elif why := self.why_inputs(outputs[i]):
                 first = spoilt.setdefault(item.plant.name, i)
                 spoilt[item.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
             if why:

@@ -1,0 +1,71 @@
+"""Messages of a node of a fusion without a centre to the services of the nodes that receive it."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from pydantic_core import to_json
+
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant import Plant
+from heliograph.live.rows import HeldRow
+from heliograph.serving.output import Output
+from heliograph.simulation.centres.node_filter import NodeFilter
+
+Moment = Callable[[Plant, float], float | str]
+
+
+class Exchange:
+    """Messages of a node: each step's, of its estimate before the step and its measurement, once, to its receivers.
+
+    A step's message goes with the measurement; from a node without a sensor when anything of the step comes, and where
+    a measurement is missing when the next step has begun. A message that is lost is lost: what neighbours claim stands.
+
+    Args:
+        fleet: the plants; of a network that is no single node nothing is sent.
+        moment: time of a row of a plant, as messages have it.
+    """
+
+    def __init__(self, fleet: Fleet, moment: Moment):
+        self.fleet, self._moment = fleet, moment
+        nodes = {name: item for name, item in fleet.network.fused.items() if isinstance(item, NodeFilter)}
+        self._name = next(iter(nodes), "")
+        self._node = nodes.get(self._name)
+
+    def messages(self, plants: Iterable[Plant]) -> list[Output]:
+        """Return the messages that the events taken since the last finalisation make due, after their steps."""
+        if self._node is None:
+            return []
+        return [output for plant in plants for row in self._due(plant) for output in self._sent(plant, row)]
+
+    def _due(self, plant: Plant) -> list[HeldRow]:
+        """Return rows that are whole now and were not before: measured, or with a row after them."""
+        assert self._node is not None
+        before: dict[int, bool] = {}  # of each row with changes whether it was measured; of new ones none
+        for row, old in plant.changes:
+            before.setdefault(id(row), old is not None and self._measured(old[1]))
+        new = {id(row) for row, old in plant.changes if old is None}
+        held, due = plant.rows.held, []
+        for i, row in enumerate(held[1:], 1):
+            after = held[i + 1] if i + 1 < len(held) else None
+            followed = after is not None and id(after) not in new and id(row) not in new
+            sent = followed or before.get(id(row), self._measured(row.events))
+            if (self._measured(row.events) or after is not None) and not sent:
+                due.append(row)
+        return due
+
+    def _measured(self, events: Iterable[tuple[int, int, float]]) -> bool:
+        """Test whether a row has the node's measurement, or anything where the node has no sensor."""
+        assert self._node is not None
+        return any(place == 0 or (place > 0 and not self._node.measured[0]) for place, _, _ in events)
+
+    def _sent(self, plant: Plant, row: HeldRow) -> list[Output]:
+        assert self._node is not None
+        pool, network = self.fleet.pool, self.fleet.network
+        _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])
+        before = central[self._name].before
+        measurement = row.numbers[: self._node.measured[0]]
+        values = np.concatenate([before.mean[0], np.ravel(before.covariance[0]), measurement]).tolist()
+        time = int(row.key[0])
+        message = {"plant": plant.name, "node": network.names[0], "sequence": time, "values": values}
+        body = to_json(message | {"time": self._moment(plant, row.key[0])}, inf_nan_mode="null")
+        return [Output(None, plant.name, "message", body, name) for name in self._node.receivers]

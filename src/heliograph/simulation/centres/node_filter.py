@@ -1,0 +1,169 @@
+"""One node of a fusion between neighbours as a filter: its measurements are its sensor's and its neighbours' messages.
+
+What a node needs of the others is in their messages, so that each can run in another process.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import block_diag
+
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.innovation import gaussian_innovation, no_innovation
+from heliograph.fusion.mesh.graph import Graph, graph_of
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike
+from heliograph.simulation.centres.centre import Apart, observation_model
+from heliograph.simulation.centres.edges import Edges
+from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node, ReceivingNode
+
+
+class NodeState(NamedTuple):
+    """State of a node: before the step, which is what its message of this step says, the inputs of it, and now."""
+
+    before: MeshState
+    inputs: Array
+    now: MeshState
+
+
+class NodeFilter(AbstractSizedFilter):
+    """Filter of one node of a fusion between neighbours; of the mesh it has one row and the neighbours' sensors.
+
+    The measurement is z of the node itself, then for each neighbour j the mean (n,) and covariance (n, n) of its
+    estimate before the step and its z_j: NaN where the message did not come. Claim: as the fusion's, whatever comes.
+    """
+
+    mesh: Mesh
+    measured: tuple[int, ...] = eqx.field(static=True)  # numbers of each sensor, the node's first
+    receivers: tuple[str, ...] = eqx.field(static=True)  # nodes that receive this one's messages
+
+    @in_float64
+    def init(self) -> NodeState:
+        """Return the plant's initial law."""
+        start = self.mesh.init()
+        alone = start._replace(mean=start.mean[:1], covariance=start.covariance[:1])
+        return NodeState(alone, jnp.zeros(len(self.inputs)), alone)
+
+    @predicts
+    def predict(self, state: NodeState, u: ArrayLike = (), k: Step = 0) -> NodeState:
+        """Predict from the node's estimate alone, as if no message came."""
+        return self._after(state.now, jnp.full(self.received, jnp.nan), jnp.asarray(u), k)
+
+    @corrects
+    def correct(self, state: NodeState, z: ArrayLike, k: Step = 0) -> tuple[NodeState, Innovation]:
+        """Fuse, predict and correct with what came; innovations of the measurements about the node's prediction."""
+        mean, covariance = state.now.mean[0], state.now.covariance[0]
+        observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
+        sensed, _, _ = self._parts(jnp.asarray(z), state.before)
+        sensors = [(i, size) for i, size in enumerate(self.measured) if size]
+        if not sensors:
+            return self._after(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
+        gain, offset = (jnp.concatenate([part[i, :size] for i, size in sensors])
+                        for part in (observation.gain, observation.offset))  # fmt: skip
+        noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
+        total = gain @ covariance @ gain.T + noise
+        innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
+        return self._after(state.before, jnp.asarray(z), state.inputs, k), innovation
+
+    @in_float64
+    def estimate(self, state: NodeState) -> Estimate:
+        """Mean and covariance of the node."""
+        return Estimate(jnp.asarray(state.now.mean)[0], jnp.asarray(state.now.covariance)[0], self.claim)
+
+    def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState, jax.Array]:
+        """Measurements of node and neighbours, their estimates, and whose message came."""
+        n, at_place = len(self.states), self.measured[0]
+        sensed, means, covariances, came = [z[:at_place]], [before.mean[0]], [before.covariance[0]], [jnp.asarray(True)]
+        for size in self.measured[1:]:
+            mean, rest = z[at_place : at_place + n], z[at_place + n : at_place + n + n * n]
+            at_place += n + n * n + size
+            sensed.append(z[at_place - size : at_place])
+            # A message without an estimate is none: any regular covariance does for it.
+            arrives = ~(jnp.any(jnp.isnan(mean)) | jnp.any(jnp.isnan(rest)))
+            means.append(jnp.where(arrives, mean, means[0]))
+            covariances.append(jnp.where(arrives, symmetrize(rest.reshape(n, n)), covariances[0]))
+            came.append(arrives)
+        return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances)), jnp.stack(came)
+
+    def _after(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
+        sensed, all_nodes, came = self._parts(z, before)
+        now, _ = self.mesh.step(
+            all_nodes, [part[None] for part in sensed], came[None, None], jnp.asarray(u), jnp.asarray(k)
+        )
+        return NodeState(before, u, now)
+
+
+def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
+    """Filter of a node of the fusion `fusion` between neighbours of `network`, on what its neighbours send.
+
+    Raises:
+        ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events.
+    """
+    item, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
+    what = f"node {node!r} of fusion {fusion!r} by itself"
+    if item.rule.needs_joint:
+        raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
+                   type(item.rule).__name__)  # fmt: skip
+    if item.rounds > 1 or item.alpha is not None:
+        raise fail(what, "one exchange a step", "several rounds" if item.rounds > 1 else "events")
+    # The node's row of the graph: itself, then its neighbours.
+    graph, neighbours = graph_of(item.neighbours or {}, nodes), item.neighbours or {}
+    i, count = nodes.index(node), 1 + len(neighbours[node])
+    row = Graph(nodes, graph.senders[i : i + 1, :count], np.ones((1, count), dtype=bool))
+    names = (node, *neighbours[node])
+    sensors = [network.nodes[name] for name in names]
+    models = [observation_model([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in sensors]
+    sizes = tuple(n.received for n in sensors)
+    mesh = Mesh(
+        plant=network.plant,
+        buckets=(Rows(item.rule.placed(row), np.zeros(1, dtype=int), count),),
+        ranks=np.zeros(1, dtype=int),
+        edges=Edges((), np.zeros(0, dtype=int), row.present, 1),
+        observation_model=Apart(tuple(models), np.arange(count), max(1, *sizes), (1,) * count),
+        senders=np.arange(count)[None],
+        places=((0,),),
+        nodes=names,
+        alpha=None,
+        needs_joint=False,
+        claim=network.claims()[node][fusion],
+    )
+    return NodeFilter(
+        mesh=mesh,
+        measured=sizes,
+        receivers=tuple(name for name in nodes if node in neighbours[name]),
+        claim=mesh.claim,
+        states=network.states,
+        inputs=network.inputs,
+        received=sizes[0] + sum(_numbers(len(network.states), size) for size in sizes[1:]),
+    )
+
+
+def node_network(network: Network, node: str) -> Network:
+    """Network of one node of a fusion between neighbours: itself, and its neighbours as senders of messages.
+
+    Raises:
+        ValueError: not one fusion between neighbours, no node of it, one that cannot run by itself.
+    """
+    if len(network.meshes) != 1:
+        raise fail("a node by itself", "a network with one fusion between neighbours", list(network.meshes) or "none")
+    (name,) = network.meshes
+    nodes = network.mesh_nodes(name)
+    if node not in nodes:
+        raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
+    senders = (network.meshes[name].neighbours or {})[node]
+    received = {j: _numbers(len(network.states), network.nodes[j].received) for j in senders}
+    parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
+    return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
+
+
+def _numbers(n: int, size: int) -> int:
+    """Numbers of a neighbour's message: mean, covariance, measurement."""
+    return n + n * n + size

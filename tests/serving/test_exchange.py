@@ -1,0 +1,224 @@
+"""Nodes of a fusion without a centre, each a service of its own: what they tell, what gets lost, and one is killed."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.live.fleet import Fleet, Options
+from heliograph.live.lanes import Lanes
+from heliograph.serving.brokers.url import address
+from heliograph.serving.running import ServiceSettings, of_node
+from heliograph.serving.service import Service
+from heliograph.serving.storage.store_protocol import InMemoryStore
+from heliograph.simulation.centres.node_filter import node_network
+
+ROOT = Path(hg.__file__).parents[2]
+
+PLANT = hg.LinearPlant([[1.0, 0.3], [0.0, 0.95]], 0.1 * np.eye(2), [1.0, 0.0], np.eye(2))
+NEAR = {"a": ["b"], "b": ["a", "c"], "c": ["b"]}
+STEPS = 12
+
+
+def chain(rule: hg.fusion.AbstractFusion | None = None, **options: object) -> hg.Network:
+    """Two nodes that measure one state each, and one between them that has no sensor."""
+    parts: dict[str, hg.Node | None] = {"b": None}
+    for name, row in (("a", [1.0, 0.0]), ("c", [0.0, 1.0])):
+        sensor = hg.LinearSensor([row], 0.3)
+        parts[name] = hg.Node(sensor, hg.perfect(), {"alone": hg.kalman_filter(PLANT, sensor)})
+    item = hg.Fusion("alone", rule or hg.fusion.TraceIntersection(), neighbours=NEAR, **options)  # type: ignore[arg-type]
+    return hg.Network(PLANT, {name: parts[name] for name in "abc"}, {"mesh": item})
+
+
+@cache
+def services() -> dict[str, Fleet]:
+    network = chain(link=hg.erasure(hg.perfect(), 0.7))
+    return {name: Fleet(Lanes(node_network(network, name)), Options()) for name in "abc"}
+
+
+def exchanged(lost: np.ndarray) -> dict[str, dict[int, dict[str, list]]]:
+    """Estimates of the nodes by step; `lost` (step, edge) of the edges "ab", "ba", "bc", "cb"."""
+    nodes = {name: Service(item, InMemoryStore()) for name, item in services().items()}
+    results: dict[str, dict[int, dict[str, list]]] = {name: {} for name in nodes}
+    z = measured()
+    for k in range(STEPS):
+        waiting: list[tuple[str, bytes]] = [
+            (name, json.dumps({"node": name, "sequence": k, "time": k, "values": z[name][k].tolist()}).encode())
+            for name in "ac"
+        ]
+        while waiting:
+            to, body = waiting.pop(0)
+            for output in nodes[to].take([body]):
+                content = json.loads(output.body)
+                if output.kind == "message" and not lost[k, ["ab", "ba", "bc", "cb"].index(to + output.to)]:
+                    waiting.append((output.to, output.body))
+                elif output.kind == "provisional":
+                    results[to][content["time"]] = content["estimates"]["fused"]["mesh"]
+                assert output.kind != "refused", content
+    return results
+
+
+@cache
+def measured() -> dict[str, np.ndarray]:
+    record = hg.simulate(chain(), STEPS, key=3)
+    return {name: np.asarray(record.measurements[name]) for name in "abc"}
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.4])
+def test_services_that_exchange_messages_tell_what_one_run_tells(loss: float):
+    lost = np.random.default_rng(1).random((STEPS, 4)) < loss
+    lost[:, 0] &= ~lost[:, 3]  # a node without a sensor sends once anything of the step came
+    flags = np.where(lost, np.nan, 1.0)
+    reports = {"a": flags[:, 1:2], "b": flags[:, [0, 3]], "c": flags[:, 2:3]}
+    network = chain(link=hg.erasure(hg.perfect(), 0.7))
+    record = hg.run(network, measured(), reports={"mesh": reports})
+    result = exchanged(lost)
+    for name in "abc":
+        expected = record.estimates[name]["mesh"]
+        for k in range(STEPS):
+            item = result[name][k]
+            assert item["claim"] == "upper"
+            # The same operations but for the order of sums.
+            np.testing.assert_allclose(item["mean"], expected.mean[k], atol=1e-12)
+            np.testing.assert_allclose(item["covariance"], expected.covariance[k], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rule", "options", "message"),
+    [
+        (hg.fusion.MatrixWeights(), {}, "its neighbours' covariances alone .an intersection., got MatrixWeights"),
+        (None, {"rounds": 2}, "one exchange a step, got several rounds"),
+        (None, {"alpha": 0.5}, "one exchange a step, got events"),
+    ],
+)
+def test_bad_input_what_no_node_can_do_by_itself_is_refused(rule, options, message):
+    with pytest.raises(ValueError, match=message):
+        node_network(chain(rule, **options), "a")
+
+
+def test_bad_input_no_node_no_broker():
+    settings = ServiceSettings(chain(), Options())
+    with pytest.raises(ValueError, match=r"--node: expected a broker between the nodes .* got none"):
+        of_node(settings, "a")
+    settings = replace(settings, broker=address("mqtt://hub/rooms", {}))
+    with pytest.raises(ValueError, match="node: expected one of fusion 'mesh': a, b, c, got 'd'"):
+        of_node(settings, "d")
+    assert str(of_node(settings, "b").broker) == "mqtt://hub:1883/rooms/b"
+
+
+class Process:
+    """`heliograph serve --node NAME`, with a store of its own."""
+
+    def __init__(self, folder: Path, node: str, broker: str):
+        (folder / "network.py").write_text("from tests.serving.test_exchange import chain\nnetwork = chain()\n")
+        command = [sys.executable, "-m", "heliograph", "serve", "network.py", "--node", node, "--broker", broker]
+        environment = os.environ | {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT / 'studies'}:{ROOT}"}
+        self.log = open(folder / f"{node}.log", "ab")  # noqa: SIM115
+        self.process = subprocess.Popen(command, cwd=folder, env=environment, stdout=self.log, stderr=self.log)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.log.close()
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.real(k.upper())) for k in ("mqtt", "nats")])
+def test_of_three_processes_one_is_killed_and_catches_up(kind: str, tmp_path: Path):
+    """Without the messages of the steps that it missed the node without a sensor would claim three times as much."""
+    import nats
+
+    from heliograph_studies.live.server import Server
+    from tests.serving.broker_servers import at, published, sent
+
+    steps, results = 300, dict[tuple[str, str], dict[int, dict[str, list]]]()
+    record = hg.simulate(chain(), steps, key=5)
+
+    async def taken(message: "nats.aio.msg.Msg") -> None:
+        content, (_, node, _, what, _) = json.loads(message.data), message.subject.split(".")
+        if what in ("provisional", "final"):
+            results.setdefault((node, what), {})[int(content["time"])] = content["estimates"]["fused"]["mesh"]
+
+    async def until(ready: Callable[[], bool]) -> None:
+        async with asyncio.timeout(90):
+            while not ready():
+                await asyncio.sleep(0.05)
+
+    def newest(node: str, what: str = "provisional") -> int:
+        return max(results.get((node, what), {-1: {}}))
+
+    async def measure(k: int) -> None:
+        for node in "ac":
+            z = np.asarray(record.measurements[node])[k].tolist()
+            body = json.dumps({"node": node, "sequence": k, "time": k, "values": z}).encode()
+            where = at(server, kind, f"chain/{node}")
+            if kind == "mqtt":
+                await asyncio.to_thread(published, where, [body], "_")
+            else:
+                await sent(replace(where, topic=f"chain.{node}"), [body], "")
+
+    async def work() -> tuple[int, int]:
+        client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
+        await client.subscribe("chain.*.out.*.*", cb=taken)
+        if kind == "nats":  # its streams are there once the services are
+            stream = client.jetstream()
+            names = ["chain-a", "chain-b", "chain-c"]
+            await until_async(lambda: all_there(stream, names))
+        k = 0
+        while min(map(newest, "abc")) < 3:
+            await measure(k)
+            await asyncio.sleep(0.5)
+            k += 1
+        # One is killed; the others go on.
+        processes["b"].kill()
+        gone = k
+        for k in range(gone, gone + 6):
+            await measure(k)
+        await until(lambda: newest("a") == newest("c") == gone + 5)
+        assert newest("b") < gone
+        processes["b"] = Process(tmp_path, "b", broker)
+        await until(lambda: newest("b") >= gone)
+        for k in range(gone + 6, gone + 20):
+            await measure(k)
+            await asyncio.sleep(0.05)
+        await until(lambda: newest("b") == gone + 19 and newest("b", "final") >= gone + 6)
+        await client.close()
+        return gone, gone + 20
+
+    with Server(tmp_path) as server:
+        broker = f"{kind}://127.0.0.1:{getattr(server, kind)}/chain"
+        processes = {name: Process(tmp_path, name, broker) for name in "abc"}
+        try:
+            gone, end = asyncio.run(work())
+        finally:
+            for process in processes.values():
+                process.kill()
+    traces = {k: np.trace(item["covariance"]) for k, item in results["b", "final"].items()}
+    missed = [traces[k] for k in range(gone, gone + 6)]
+    assert max(missed) < 1.5 * traces[gone - 1], traces
+    for (node, _), known in results.items():
+        last = known[max(known)]
+        assert {item["claim"] for item in known.values()} == {"upper"}
+        off = record.truth[max(known)] - np.array(last["mean"])
+        # Chi-squared of two degrees of freedom, beyond which one in a hundred thousand lies.
+        assert off @ np.linalg.solve(last["covariance"], off) < 23, node
+    assert end <= steps
+
+
+async def all_there(stream: "nats.js.JetStreamContext", names: list[str]) -> bool:
+    known = [item.config.name for item in await stream.streams_info()]
+    return set(names) <= set(known)
+
+
+async def until_async(ready: Callable[[], object]) -> None:
+    async with asyncio.timeout(90):
+        while not await ready():  # type: ignore[misc]
+            await asyncio.sleep(0.1)
