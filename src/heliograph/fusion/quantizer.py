@@ -14,7 +14,7 @@ from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Numbers = TypeAliasType("Numbers", Float[Array, "*n"])
@@ -104,10 +104,9 @@ def segment_of(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Ar
 def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
     """Midpoint of a segment; exactly zero for the middle one of an odd number.
 
-    The amplitude's power of two is factored out, which changes no bit, or its product with many levels would overflow.
+    The quotient comes first: the product with many levels could overflow.
     """
-    fraction, power = jnp.frexp(jnp.asarray(amplitude))
-    return jnp.ldexp((2 * segment + 1 - levels) * fraction / levels, power)
+    return jnp.asarray((2 * segment + 1 - levels) / levels * amplitude)
 
 
 def levels_of(value: int) -> Float[np.ndarray, ""]:
@@ -181,7 +180,9 @@ class UniformQuantizer(AbstractQuantizer):
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment's length."""
-        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
+        half = self.scale * self.amplitude / self.levels
+        result: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
+        return result
 
     def claim(self, claim: Claim) -> Claim:
         """Lower a claim to "upper" at most."""
