@@ -34,8 +34,10 @@ def square_of(dimension: int) -> hg.linear.LinearSystem:
     skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
     noise = hg.random_affine.Independent([skewed] * half)
     bias = hg.LinearPlant(0.5 * np.eye(half), noise, np.zeros(half), noise)
-    plant = hg.model.with_bias(hg.LinearPlant(a, noise, np.zeros(half), noise), 0.1 * np.eye(half), bias)
-    sensor = hg.LinearSensor(generator.normal(size=(1, dimension)), skewed)
+    state, driven = hg.LinearPlant(a, noise, np.zeros(half), noise), 0.1 * np.eye(half)
+    row = generator.normal(size=(1, dimension))  # the output has the state in it, and the bias
+    sensor = hg.LinearSensor(row[:, :half], skewed)
+    plant, sensor = hg.model.with_bias(state, sensor, bias, coupling=driven, loading=row[:, half:])
     powers = hg.Discrete(np.sqrt([1.0, 1.5, 2.0]), [0.1, 0.3, 0.6])
     channel = hg.amplify_and_forward([hg.hop(powers, skewed), hg.hop(powers, skewed)])
     return hg.linear.lifted_system(plant, sensor, channel, 2, 2)

@@ -15,7 +15,7 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compiled
 
-ROWS = 8  # what is compiled serves every number of rows up to the next multiple of it
+ROWS = 64  # what is compiled serves every number of rows up to the next multiple of it, and rows cost next to nothing
 
 
 class Followed(NamedTuple):

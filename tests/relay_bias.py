@@ -29,13 +29,14 @@ def model(s: oracle.System, horizon: int, initial=None) -> Model:
     n, extra = s.C.shape[1], len(s.F)
     bias = hg.LinearPlant(s.F, support(s.xi), np.zeros(extra), support(s.eps0))
     start = support(s.x0) if initial is None else initial
+    measuring = hg.LinearSensor(s.C, hg.random_affine.Shaped(s.D, support(s.v)))
 
     def at_time(t):
         state = hg.LinearPlant(s.A(t), hg.random_affine.Shaped(s.B, support(s.w)), np.zeros(n), start)
-        return hg.model.with_bias(state, s.E(t), bias)
+        return hg.model.with_bias(state, measuring, bias, coupling=s.E(t))
 
-    plant = hg.model.over_time([at_time(t) for t in range(horizon)])
-    sensor = hg.LinearSensor(s.C @ np.eye(n, n + extra), hg.random_affine.Shaped(s.D, support(s.v)))
+    plants, (sensor, *_) = zip(*(at_time(t) for t in range(horizon)), strict=True)
+    plant = hg.model.over_time(plants)
     first = hg.random_affine.GainAndNoise(powers(s.l), s.Phi, support(s.varpi))
     second = hg.random_affine.GainAndNoise(powers(s.m), s.theta * s.Psi, support(s.sigma))
     return Model(plant, sensor, hg.amplify_and_forward([first, second]))

@@ -52,8 +52,8 @@ def test_a_skewed_sensor_with_a_bias():
     errors = hg.random_affine.recorded_noise(bench, order=4)
     tank = hg.LinearPlant([[0.9]], [[0.002]], [5.0], [[0.2]], states=["level"])
     leak = hg.LinearPlant([[0.98]], [[0.0001]], [0.0], [[0.001]], states=["leak"])
-    both = hg.model.with_bias(tank, [[1.0]], leak)
-    gauge = hg.LinearSensor([[1.0, 0.0]], errors, outputs=["level"])
+    gauge = hg.LinearSensor([[1.0]], errors, outputs=["level"])
+    both, gauge = hg.model.with_bias(tank, gauge, leak, coupling=[[1.0]])
     filters = {
         "textbook": hg.linear_filter(both, gauge, hg.perfect()),
         "quadratic": hg.polynomial_filter(both, gauge, hg.perfect(), horizon=15),

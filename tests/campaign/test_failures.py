@@ -46,6 +46,7 @@ def test_a_chunk_is_tried_again(tmp_path, expected, monkeypatch):
     assert not (tmp_path / "out" / "failures.json").exists()
 
 
+@pytest.mark.slow
 def test_a_chunk_that_fails_is_reported_and_runs_alone(tmp_path, expected, monkeypatch, capsys):
     tried = fail_chunk(monkeypatch, 3)
     campaign, out = write(tmp_path), tmp_path / "out"

@@ -154,5 +154,7 @@ def test_the_noise_of_a_bag_is_learned(folder, capsys):
         "0",
     ]
     assert cli.main(command) == 0, capsys.readouterr().err
-    (row,) = json.loads((folder / "out" / "fitted.json").read_text())["table"]
+    fitted = json.loads((folder / "out" / "fitted.json").read_text())
+    (row,), (share,) = fitted["table"], fitted["delays"]["gps"]["shares"]
     assert row["low"] <= 0.04 <= row["high"] < 0.15
+    assert (share["steps"], share["estimate"]) == (0, 1.0) and "gps: late by 0 s 1 (" in capsys.readouterr().out

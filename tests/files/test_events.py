@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.cli import main
-from heliograph.files.events import holds_events, read_events
+from heliograph.files.events import event_table, holds_events, read_events
 from heliograph.live.event import Event
 from heliograph.live.recorded import play
 
@@ -81,6 +81,19 @@ def test_every_way_to_write_events_is_read_alike(tmp_path, network):
     same(plain, read_events(tmp_path / "d.parquet", network)[0])
     assert all(holds_events(tmp_path / name) for name in ("a.csv", "b.csv", "c.csv", "d.parquet"))
     assert not holds_events(written(tmp_path / "rows.csv", ["time", "left"], [(0, 1)]))
+
+
+def test_a_table_of_events_has_rows_and_delays(tmp_path, network):
+    """Rows in the order of measuring, a repeated event once; dates or numbers; late by 0.1, 15, 1.5 and 0.5 s."""
+    for name, when in (("a.csv", float), ("b.csv", dated)):
+        rows = [(n, s, when(t), when(a), *rest) for n, s, t, a, *rest in ROWS]
+        table = event_table(written(tmp_path / name, HEADER, rows), network)
+        recording = table.recording()
+        np.testing.assert_array_equal(recording.time, [0.0, 0.5, 1.5, 2.0, 3.0, 9.0])
+        np.testing.assert_array_equal(recording.measurements["cart"][3], [2.0, 1.9])
+        delays = table.delays(0.5)["cart"]
+        assert list(delays.shares) == [0, 1, 3, 29] and delays.counted == 6
+        assert delays.shares[0].estimate == 1 / 3
 
 
 @pytest.mark.parametrize(

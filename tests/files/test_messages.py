@@ -177,25 +177,34 @@ def test_inputs_hold_and_repeated_events_count_once(world):
     np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [5.0, np.nan, 7.0])
 
 
-def test_a_law_of_delays_is_learned_from_the_times_of_logging(world, tmp_path):
+def test_a_fit_learns_the_law_of_delays_from_the_times_of_logging(world, tmp_path):
     """Delays of 0, 1 and 3 steps, in 60, 30 and 10 of 100: within three deviations of a share of 1,000 messages."""
     network, sources, *_ = world
     chance, share = np.random.default_rng(0), np.array([0.6, 0.3, 0.1])
     delays, jitter = chance.choice([0, 1, 3], 1000, p=share), chance.uniform(-0.4, 0.4, 1000)
+    noise = 0.2 * chance.standard_normal(1000)
     messages = []
     for k, (d, part) in enumerate(zip(delays, jitter, strict=True)):
         at = bags.START + k * 10**8
         messages.append(
-            (at + round(max(d + part, 0.0) * 10**8), "/odometry", bags.ODOMETRY, bags.odometry(at, 0.1 * k))
+            (at + round(max(d + part, 0.0) * 10**8), "/odometry", bags.ODOMETRY, bags.odometry(at, 0.1 * k + noise[k]))
         )
     path = bags.write(tmp_path / "late", sorted(messages, key=lambda item: item[0]))
     table = hg.files.read_messages(path, network, sources)
-    law = table.delay_law("gps", 0.1)
+
+    def build():
+        sensor = hg.Sensor(lambda x: x[:1], hg.free(1.0, "variance"))
+        return hg.Network(network.plant, {"gps": hg.Node(sensor, hg.perfect(), {})})
+
+    fitted = hg.fit(build, table, starts=1)
+    (row,), delays = fitted.table, fitted.delays["gps"]
+    assert row.low < 0.04 < row.high
+    assert delays.step == 0.1 and (delays.counted, delays.early) == (1000, 0)  # of steps, by their median
+    law = delays.law
     np.testing.assert_array_equal(law.values, [0.0, 1.0, 3.0])
-    assert np.all(np.abs(law.probabilities - share) < 3 * np.sqrt(share * (1 - share) / 1000))
+    assert all(part.low <= p <= part.high for part, p in zip(delays.shares.values(), share, strict=True))
     assert hg.model.delayed(hg.perfect(), law).times == (0, 1, 3)
-    with pytest.raises(ValueError, match="node of a delay law: expected one of gps, which have events, got inputs"):
-        table.delay_law("inputs", 0.1)
+    assert "gps: late by 0 s 0." in str(fitted) and list(table.delays()) == ["gps"]
 
 
 def test_dates_become_steps_of_a_network_that_counts_them(tmp_path):

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.innovation import outlying, summarise_innovations
-from heliograph.model.estimate import Innovation
+from heliograph.filters.innovation import Weighed, outlying, summarise_innovations
 
 
 def drawn(rng, steps, correlation=0.0, weight=None):
     e = rng.standard_normal((steps, 2))
     for k in range(1, steps):
         e[k] = correlation * e[k - 1] + np.sqrt(1 - correlation**2) * e[k]
-    return Innovation(e, np.broadcast_to(np.eye(2), (steps, 2, 2)), np.zeros(steps), weight)
+    return Weighed(e, np.ones((steps, 2)), np.ones((steps, 2)) if weight is None else weight)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
@@ -47,8 +46,7 @@ def in_runs(rng, shares, length=3, steps=1000):
     """Weights of outputs whose outliers come in runs, as behind a mean over some readings; white innovations."""
     starts = rng.random((steps, len(shares))) < np.array(shares) / length
     down = np.any([np.roll(starts, i, axis=0) for i in range(length)], axis=0)
-    sizes = np.broadcast_to(np.eye(len(shares)), (steps, len(shares), len(shares)))
-    return Innovation(rng.standard_normal(down.shape), sizes, np.zeros(steps), np.where(down, 0.1, 1.0))
+    return Weighed(rng.standard_normal(down.shape), np.ones(down.shape), np.where(down, 0.1, 1.0))
 
 
 def test_outliers_in_runs_are_one_event_each():

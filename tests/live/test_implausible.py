@@ -16,7 +16,7 @@ def same(result, expected):
             np.testing.assert_array_equal(result[node][name].covariance, estimate.covariance, f"{node}/{name}")
 
 
-@pytest.mark.parametrize("make", [forgetful, moving])
+@pytest.mark.parametrize("make", [pytest.param(forgetful, marks=pytest.mark.slow), moving])
 def test_absurd_events_leave_no_trace(make):
     """Of nodes and of inputs, newest and late ones, in a row of their own and in one that others have."""
     network = make()

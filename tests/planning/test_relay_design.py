@@ -44,7 +44,7 @@ def test_the_network_it_gives_sends_and_errs_as_designed(design):
     )  # converged after 100 steps
 
 
-def test_what_relays_that_filter_do_not_take_is_named(relays, design):
+def test_what_relays_that_filter_do_not_take_is_named(relays):
     for given in (
         {"free": ["north"]},
         {"target_error": 0.1},
@@ -53,5 +53,9 @@ def test_what_relays_that_filter_do_not_take_is_named(relays, design):
     ):
         with pytest.raises(ValueError, match="relays that filter: expected"):
             hg.design(relays, **given)
+
+
+@pytest.mark.slow
+def test_a_network_of_relays_that_filter_is_refused(design):
     with pytest.raises(ValueError, match="network: expected a RelayNetwork alone"):
         hg.design(design.network, budget=1)

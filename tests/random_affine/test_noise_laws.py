@@ -114,9 +114,9 @@ def test_a_plant_draws_its_initial_state_from_the_law():
 
 
 def test_with_bias_refuses_what_does_not_fit():
-    plant = hg.LinearPlant(np.eye(2), 1.0, np.zeros(2), 1.0)
+    plant, sensor = hg.LinearPlant(np.eye(2), 1.0, np.zeros(2), 1.0), hg.LinearSensor([[1.0, 0.0]], 1.0)
     with pytest.raises(ValueError, match=r"coupling of the bias: expected shape \(2, 2\), got shape \(2, 1\)"):
-        hg.model.with_bias(plant, np.ones((2, 1)), plant)
+        hg.model.with_bias(plant, sensor, plant, coupling=np.ones((2, 1)))
     driven = hg.LinearPlant(np.eye(1), 1.0, np.zeros(1), 1.0, np.ones((1, 1)))
-    with pytest.raises(ValueError, match="a plant without inputs"):
-        hg.model.with_bias(plant, np.ones((2, 1)), driven)
+    with pytest.raises(ValueError, match=r"a plant whose inputs are some of \[\], got \['u0'\]"):
+        hg.model.with_bias(plant, sensor, driven, coupling=np.ones((2, 1)))

@@ -36,7 +36,7 @@ def test_only_filters_that_weigh_say_that_they_do():
 
 
 def test_the_output_with_outliers_is_to_blame(recorded):
-    left, right = weighed_outputs(NETWORK, hg.run(NETWORK, {"tank": recorded}), np.zeros((STEPS, 0)))
+    left, right = weighed_outputs(NETWORK, hg.run(NETWORK, {"tank": recorded}))
     arrived = ~np.isnan(recorded)
     assert (left.summary.received, right.summary.received) == tuple(arrived.sum(axis=0))
     # Of the 20 rows with 15 more (14 deviations of an innovation) those that arrived, and the law's own 2 %.
@@ -50,7 +50,7 @@ def test_only_a_filter_that_the_network_relies_on_blames_an_output_where_it_weig
     """Of two that weigh the network relies on the first; of `FILTERS` on the one that does not weigh."""
     two = {"robust": FILTERS["robust"], "again": FILTERS["robust"]}
     network = hg.Network(PLANT, {"tank": hg.Node(SENSOR, LINK, two)})
-    items = weighed_outputs(network, hg.run(network, {"tank": recorded}), np.zeros((STEPS, 0)))
+    items = weighed_outputs(network, hg.run(network, {"tank": recorded}))
     assert [(item.filter, item.output) for item in items if item.to_blame] == [("robust", "left")]
     assert items[0].summary == items[2].summary
 

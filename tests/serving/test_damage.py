@@ -205,6 +205,7 @@ def test_a_store_of_an_older_release_is_refused_by_its_layout_and_release(tmp_pa
     assert not said
 
 
+@pytest.mark.slow
 def test_no_byte_of_the_file_changes_what_is_informed(whole, tmp_path, mine):
     """Either all goes on as if nothing had happened, or the damage is named in one line."""
     right, others = gone_on(copy(whole, tmp_path), mine)

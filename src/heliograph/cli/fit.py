@@ -23,7 +23,7 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or a bag.")],
+    measurements: Annotated[Path, place("CSV or Parquet: rows or events; or a bag.")],
     out: Annotated[Path, place("Folder for fitted.json, fitted_network.py, figures and a page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
@@ -71,10 +71,15 @@ def learn(
 ) -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
+    from dataclasses import replace
+
     from heliograph.cli.run import read_mapped
+    from heliograph.files.events import event_table, holds_events
     from heliograph.files.fitted import NetworkAgain
     from heliograph.files.network_file import load_module
     from heliograph.files.recording import Recording, read_recording
+
+    # Learning and its page are imported when the command runs.
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
@@ -89,16 +94,18 @@ def learn(
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
+    # Rows of a table, or events, which are rows in the order of measuring.
     messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
+    if messages is None and holds_events(measurements):
+        messages = event_table(measurements, start)
     recording = read_recording(measurements, start) if messages is None else messages.recording()
     if truth and recording.truth is None:
         raise fail(f"{measurements}", "columns of the true states, truth.STATE, for --truth", "none")
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
-    true = None if recording.truth is None else recording.truth[:cut]
     early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
-                      recording.time[:cut], true)  # fmt: skip
+                      recording.time[:cut], None if recording.truth is None else recording.truth[:cut])  # fmt: skip
 
     # Progress by iterations of the search.
     def say(line: str) -> None:
@@ -109,6 +116,7 @@ def learn(
     # The fit.
     fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
     assert isinstance(fitted, Fit)  # since no sender decides
+    fitted = replace(fitted, delays={} if messages is None else messages.delays())
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
     judged = changes(start, fitted.network, recording.measurements, recording.inputs, cut) if cut < rows else []

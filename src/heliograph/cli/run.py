@@ -107,7 +107,7 @@ def run(
             recording = read_recording(measurements, loaded) if messages is None else messages.recording()
             advance(f"filtering {len(recording.time)} rows")
             record, doubtful = _filtered(loaded, recording, later)
-            notes = _doubted(loaded, record, recording)
+            notes = _doubted(loaded, record)
         if out is not None:
             advance(f"writing {out}")
             write(record, out)
@@ -186,11 +186,11 @@ def _errors(record: "Record") -> list[str]:
     return lines
 
 
-def _doubted(network: "Network", record: "Record", recording: "Recording") -> list[str]:
+def _doubted(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
     from heliograph.report.outputs import weighed_outputs
 
-    return [str(item) for item in weighed_outputs(network, record, recording.inputs)]
+    return [str(item) for item in weighed_outputs(network, record)]
 
 
 def _claim(estimate: "Estimate") -> str:

@@ -8,11 +8,11 @@ import numpy as np
 
 from heliograph.files.recording import TIME_STEP, Recording
 from heliograph.files.sources import Reading
+from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import INPUTS, Event
-from heliograph.numerics.check import TINY, fail, instance, scalar
+from heliograph.numerics.check import fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float, Int
-from heliograph.random_affine.law import Discrete
 from heliograph.simulation.network import Network
 
 SECOND = 10**9  # nanoseconds
@@ -48,6 +48,7 @@ class EventTable:
     Args:
         network: the network.
         step: seconds of a step of a network that counts steps; None where times are steps, or seconds.
+        start: nanoseconds since 1970 of step 0; the first event's unless given.
 
     Attributes:
         columns: events by node, and of "inputs".
@@ -55,10 +56,11 @@ class EventTable:
         broken: where and why reading ended early; "" if it did not.
     """
 
-    def __init__(self, network: Network, step: float | None = None):
+    def __init__(self, network: Network, step: float | None = None, start: int | None = None):
         instance("network", network, Network, "a Network")
         self.network, self.steps = network, TIME_STEP not in network.inputs
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
+        self.start = start
         given = len(network.inputs) - (not self.steps)
         self.columns = {INPUTS: Columns(given)}
         self.columns |= {name: Columns(network.nodes[name].received) for name in network.names}
@@ -109,6 +111,8 @@ class EventTable:
         return 0 if self.steps else first
 
     def _first(self) -> int:
+        if self.start is not None:
+            return self.start
         times = [min(columns.time) for columns in self.columns.values() if columns.time]
         if not times:
             raise fail("events", "at least one", "none")
@@ -159,27 +163,23 @@ class EventTable:
                 results[name] = ((arrival - time) / SECOND)[np.argsort(time, kind="stable")]
         return results
 
-    def delay_law(self, node: str, step: float) -> Discrete:
-        """Return the most likely law of a node's delays in steps, for `delayed(link, law)`.
-
-        The share of each delay among the events is its probability; steps that no event was late by have none.
+    def delays(self, step: float | None = None) -> dict[str, Delays]:
+        """Return by node the law of its delays in steps, with intervals; nodes without any are absent.
 
         Args:
-            node: name of a node.
-            step: seconds of a step.
+            step: seconds of a step; that of the table, else the median time between a node's measurements.
 
         Raises:
-            ValueError: a node without events, a step that is not positive, an event that was logged before its time.
+            ValueError: a step that is not positive.
         """
-        late = self.lateness().get(node)
-        if late is None:
-            raise fail("node of a delay law", f"one of {', '.join(self.lateness()) or 'none'}, which have events", node)
-        delays = np.floor(late / float(scalar("step", step, TINY)) + 0.5).astype(np.int64)
-        if delays.min() < 0:
-            raise fail(f"delays of {node!r}", "no event that was logged before its time", f"{late.min():.3g} s")
-        counts = np.bincount(delays)
-        there = np.flatnonzero(counts)
-        return Discrete(there.astype(np.float64), counts[there] / counts.sum())
+        results = {}
+        for name, late in self.lateness().items():
+            apart = np.diff(np.unique(self.columns[name].arrays()[0]))
+            between = float(np.median(apart)) / SECOND if len(apart) else 1.0
+            size = step if step is not None else between if self.step is None else self.step / SECOND
+            if np.any(late > -size / 2):
+                results[name] = learn_delays(late, size)
+        return results
 
     def recording(self) -> Recording:
         """Return the events as rows in order of their times, as if none had been late; a repeated event counts once.

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from heliograph.disk.whole_file import FORMATS
-from heliograph.files.event_table import EventTable
+from heliograph.files.event_table import SECOND, EventTable
 from heliograph.files.recording import TIME_STEP, write_estimates
+from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event, whole
 from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
@@ -71,6 +72,29 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
         number = _whole(columns[SEQUENCE][row], f"{where}, column {SEQUENCE!r}")
         events.append(Event(node, number, float(time[row]), values, float(arrival[row])))
     return events, origin
+
+
+def event_table(path: str | Path, network: Network) -> EventTable:
+    """Return the events of a CSV or Parquet file as a table, as `read_messages` returns those of a bag.
+
+    Where the network counts steps a step is a second long, so that an event is as many seconds late as steps.
+
+    Args:
+        path: the file.
+        network: the network that the names belong to.
+
+    Raises:
+        ValueError: what `read_events` refuses.
+    """
+    events, origin = read_events(path, network)
+    counts = TIME_STEP not in network.inputs
+    table = EventTable(network, 1.0, 0) if counts and origin is None else EventTable(network)
+    since = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
+    for event in events:
+        logged = event.time if event.arrival is None else event.arrival
+        time, arrival = (since + round(moment * SECOND) for moment in (event.time, logged))
+        table.add(Reading("", event.node, event.sequence, time, np.asarray(event.values)), arrival)
+    return table
 
 
 def run_events(

@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.files.network_file import load_network
 from heliograph.learning.description import describe
 from heliograph.learning.fitting import Fit
+from heliograph.learning.losses.delays import Delays
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.network import Network
 
@@ -52,6 +53,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
         "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
+        "delays": {node: _delays(item) for node, item in fitted.delays.items()},
         "sentences": list(fitted.sentences),
         "log_likelihood": dict(fitted.log_likelihood),
         "ends": [_plain(float(end)) for end in fitted.ends],
@@ -94,6 +96,11 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
     if {name: np.shape(value) for name, value in values.items()} != known:
         raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
     return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
+
+
+def _delays(item: Delays) -> dict[str, Any]:
+    shares = [{"steps": steps, **share._asdict()} for steps, share in item.shares.items()]
+    return {"step": item.step, "counted": item.counted, "early": item.early, "shares": shares}
 
 
 def _plain(value: object) -> object:

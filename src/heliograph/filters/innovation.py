@@ -127,6 +127,14 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
     return carry[2]
 
 
+class Weighed(NamedTuple):
+    """Innovations by component: value, variance, and weight in the update, (..., m) each; NaN where none arrived."""
+
+    value: Array
+    variance: Array
+    weight: Array
+
+
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
 
@@ -168,7 +176,7 @@ class InnovationSummary(NamedTuple):
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {self.bias:.2g} +- {half:.1g}"
 
 
-def summarise_innovations(innovation: Innovation) -> tuple[InnovationSummary, ...]:
+def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]:
     """Summarise innovations over time, one output after the other.
 
     Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours: of
@@ -176,12 +184,9 @@ def summarise_innovations(innovation: Innovation) -> tuple[InnovationSummary, ..
     median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not hide.
 
     Args:
-        innovation: values (time, m) with covariance (time, m, m), NaN where nothing arrived, and weight (time, m).
+        innovations: value, variance and weight (time, m), NaN where nothing arrived.
     """
-    value = np.asarray(innovation.value)
-    variance = np.diagonal(np.asarray(innovation.covariance), axis1=-2, axis2=-1)
-    weight = np.ones_like(value) if innovation.weight is None else np.asarray(innovation.weight)
-    return tuple(_summary(*columns) for columns in zip(value.T, variance.T, weight.T, strict=True))
+    return tuple(_summary(*columns) for columns in zip(*(np.asarray(part).T for part in innovations), strict=True))
 
 
 def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
@@ -191,18 +196,18 @@ def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np
     if not count:
         return InnovationSummary(len(value), 0, 0, wilson(0, 0), 0.0, *[float("nan")] * 5)
     # What counts as independent: neighbours that are alike say less.
-    independent = _independent(np.argsort(np.argsort(e)).astype(float))
+    independent = independent_count(np.argsort(np.argsort(e)).astype(float))
     # The median's interval holds the quantiles between which it lies with 95 %.
     reach = NORMAL / (2 * np.sqrt(independent))
     low, middle, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
-    doubted = _independent((w < HALF).astype(float))
+    doubted = independent_count((w < HALF).astype(float))
     share = wilson(down / count * doubted, doubted)
     numbers = (float(x) for x in (w.mean(), middle, low, high, d2.mean()))
     return InnovationSummary(len(value), count, down, share, doubted, *numbers)
 
 
-def _independent(values: Float[np.ndarray, " time"]) -> float:
-    """N (1 - a) / (1 + a), a the correlation of neighbours from 0 to 0.999; at least 1."""
+def independent_count(values: Float[np.ndarray, " time"]) -> float:
+    """Number of independent values that say as much, N (1 - a) / (1 + a), a the correlation of neighbours."""
     apart = values - np.mean(values)
     power = float(np.sum(apart**2))
     a = np.clip(np.sum(apart[1:] * apart[:-1]) / power, 0.0, 0.999) if power and len(values) > 2 else 0.0

@@ -14,7 +14,7 @@ from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Numbers = TypeAliasType("Numbers", Float[Array, "*n"])
@@ -181,7 +181,9 @@ class UniformQuantizer(AbstractQuantizer):
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment's length."""
-        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
+        half = self.scale * self.amplitude / self.levels
+        result: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
+        return result
 
     def claim(self, claim: Claim) -> Claim:
         """Lower a claim to "upper" at most."""

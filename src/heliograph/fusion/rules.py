@@ -280,16 +280,16 @@ class Fusion(Module):
     Args:
         filter: name of the filter whose estimates are fused.
         rule: the fusion rule.
-        quantizer: of each node's mean on its way to the fusion centre; one for all nodes, or one for each node by its
-            name, all of one kind; None by default. The local covariance is widened by the quantizer's error.
+        quantizer: of each node's mean on its way to the fusion centre or to its neighbours; one for all nodes, or one
+            for each by its name, all of one kind; None by default. The covariance is widened by the quantizer's error.
             Covariances are assumed to arrive as they are: most are computed before any data.
         uplink: the link of the quantized mean, for rules that use reports (`AllReports`); one for all nodes, or one for
             each node by its name; None by default.
         neighbours: names of those whom each node receives, such as {"a": ["b", "c"], "b": []}, or a networkx graph of
             names; `hg.fusion.neighbours_within` makes them from positions. None, a fusion centre, by default.
-        link: channel of the messages between neighbours, which arrive as they are or not at all, and the receiver
-            knows: `erasure`, also in bursts (`gilbert_elliott`). One law for all edges, drawn apart for each, or a
-            channel for each edge by its name "SENDER to RECEIVER"; lossless by default.
+        link: channel of the messages between neighbours, which arrive as they are, late or not at all, and the receiver
+            knows: `erasure`, also in bursts (`gilbert_elliott`), `hg.model.delayed`. One law for all edges, drawn apart
+            for each, or a channel for each edge by its name "SENDER to RECEIVER"; lossless by default.
         rounds: exchanges of the neighbours at each step, 1 by default; more need a rule that intersects. Measurements
             are forwarded with the name of their node, so that each counts once.
         alpha: events. A node sends its estimate only if (xhat - xs)' P^-1 (xhat - xs) > alpha n, xs that which it sent
@@ -330,9 +330,8 @@ class Fusion(Module):
         self.alpha = None if alpha is None else float(scalar("alpha of a fusion", alpha, 0.0))
         if neighbours is None and (link is not None or rounds > 1 or alpha is not None):
             raise fail("fusion", "neighbours, where there are links between them, rounds or events", "none")
-        if neighbours is not None and (quantizer is not None or uplink is not None):
-            raise fail("fusion between neighbours", "messages that arrive as they are or not at all",
-                       "a quantizer" if uplink is None else "an uplink")  # fmt: skip
+        if neighbours is not None and uplink is not None:
+            raise fail("fusion between neighbours", "a link of each edge (link=)", "an uplink")
 
     def check(self, nodes: Sequence[str], n: int) -> None:
         """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""

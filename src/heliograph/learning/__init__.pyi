@@ -8,6 +8,10 @@ from .likelihood.predictive_density import (
     Predictive as Predictive,
     predictive as predictive,
 )
+from .losses.delays import (
+    Delays as Delays,
+    learn_delays as learn_delays,
+)
 from .losses.hidden_losses import (
     HiddenModeLosses as HiddenModeLosses,
 )

@@ -1,7 +1,8 @@
 """`fit`: estimates of what is free in a network, with intervals, and sentences on what the data cannot tell."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -12,6 +13,7 @@ from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, gathered, objectives
 from heliograph.learning.likelihood.surface import StoppedError, Surface
+from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
 from heliograph.numerics.check import check_count, check_seed, fail, shown
@@ -39,6 +41,7 @@ class Fit:
         identified: what the data can identify.
         ends: log-likelihood at which each start ended, best first (starts,).
         stopped: true if the search was interrupted, so that this is the best so far.
+        delays: by node the law of its delays, of a recording that is a table of events.
     """
 
     description: Description
@@ -46,6 +49,7 @@ class Fit:
     identified: Identifiability
     ends: Float[np.ndarray, " starts"]
     stopped: bool
+    delays: DelaysByNode = field(default_factory=dict)
 
     @property
     def best(self) -> Solution:
@@ -117,7 +121,8 @@ class Fit:
         """Table and sentences as text."""
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {_number(row)}  ({row.form})" for row in self.table]
-        return "\n".join([*lines, *self.sentences])
+        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
+        return "\n".join([*lines, *late, *self.sentences])
 
 
 def fit(
@@ -142,10 +147,13 @@ def fit(
     filter, its rule and its claim included: for errors that are correlated from row to row, of which the likelihood of
     the measurements takes the small difference between rows for the whole.
 
+    Of an `EventTable`, a bag for example, the rows are in the order of measuring, and `delays` of the result has the
+    law of each node's delays: the likelihood of stamps and values is a product, so that each part is learned apart.
+
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
-            one node alone; a `Recording`; a `Record` with all its runs; or a list of these.
+            one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
         inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ.
         starts: number of starts: the given one, and others drawn around it.
         seed: seed of the starts that are drawn.
@@ -161,10 +169,11 @@ def fit(
     """
     check_count("starts", starts)
     description = describe(network)
+    recording, delays = _rows_and_delays(recording)
     if decides(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
-        return fit_sender(description, recording, inputs, starts, check_seed("seed", seed))
+        return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
     data = gathered(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
@@ -181,7 +190,21 @@ def fit(
         if stopped:
             break
         points = climbed.x[order[:1]]
-    return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped)
+    return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped, delays)
+
+
+def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
+    """Rows of tables of events, and the laws of their delays by node; other recordings are rows."""
+    several = recording if isinstance(recording, list) else [recording]
+    tables = [item for item in several if hasattr(item, "lateness")]
+    if not tables:
+        return recording, {}
+    # Of several tables the measurements of a node are counted together, in steps of the first that has any.
+    steps = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
+    late = [table.lateness() for table in tables]
+    delays = {name: learn_delays(np.concatenate([part[name] for part in late if name in part]), step)
+              for name, step in steps.items()}  # fmt: skip
+    return [item.recording() if item in tables else item for item in several], delays
 
 
 def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:

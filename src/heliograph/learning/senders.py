@@ -1,7 +1,7 @@
 """Numbers of a sender that decides when to send, learned from what came and from what did not."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
 from heliograph.learning.likelihood.objective import gathered
+from heliograph.learning.losses.delays import DelaysByNode
 from heliograph.learning.solution import TWO_SIDED, Row
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -37,6 +38,7 @@ class SenderFit:
         total: log-likelihood of the maximum, in nats.
         table: a row for each number.
         converged: True if the search for the maximum converged.
+        delays: by node the law of its delays, of a recording that is a table of events.
     """
 
     description: Description
@@ -44,6 +46,7 @@ class SenderFit:
     total: float
     table: tuple[Row, ...]
     converged: bool
+    delays: DelaysByNode = field(default_factory=dict)
 
     @property
     def network(self) -> Network:
@@ -73,7 +76,8 @@ class SenderFit:
         """The table and the sentences."""
         width = max(len(row.name) for row in self.table)
         lines = [f"{row.name:{width}}  {row.estimate:10.4g}  ({row.low:.4g} .. {row.high:.4g})" for row in self.table]
-        return "\n".join([*lines, *self.sentences])
+        late = [f"{node}: {delays}" for node, delays in self.delays.items()]
+        return "\n".join([*lines, *late, *self.sentences])
 
 
 def decides(network: Network) -> bool:

@@ -33,17 +33,14 @@ from .over_time import (
 from .enlarged import (
     with_past as with_past,
 )
-from .enlarged import (
-    with_bias as with_bias,
-)
 from .relays import (
     RelayNetwork as RelayNetwork,
 )
 from .sensor import (
     AbstractSensor as AbstractSensor,
 )
-from .sensor_bias import (
-    with_sensor_bias as with_sensor_bias,
+from .bias import (
+    with_bias as with_bias,
 )
 from .trigger import (
     AbstractTrigger as AbstractTrigger,

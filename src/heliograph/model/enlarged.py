@@ -1,4 +1,4 @@
-"""Plants with further states: a dynamical bias, past outputs of the sensor, offset and drift of clocks."""
+"""Plants with further states: past outputs of the sensor, offset and drift of clocks."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
 from heliograph.numerics.module import readable
@@ -19,47 +20,6 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.delay import of_line
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped, Square, Vector
-
-
-def with_bias(plant: LinearPlant, coupling: "Float[ArrayLike, 'n bias']", bias: LinearPlant) -> LinearPlant:
-    """Return the plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
-
-    Every filter of the result estimates both. A name that the plant has too gets the prefix "bias_".
-
-    Args:
-        plant: the plant of x (n states).
-        coupling: E (n, bias states).
-        bias: the plant of b, without inputs, independent of the first.
-
-    Raises:
-        ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
-    Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
-    """
-    for what, item in (("plant with bias", plant), ("bias", bias)):
-        instance(what, item, LinearPlant, "a LinearPlant")
-    n, extra = len(plant.states), len(bias.states)
-    coupling = array("coupling of the bias", coupling, (n, extra))
-    if bias.inputs:
-        raise fail("bias", "a plant without inputs", list(bias.inputs))
-    # (w, xi) and the two initial states are independent.
-    noises = [p.noise for p in (plant, bias) if isinstance(p.noise, AbstractNoise)]
-    if len(noises) < 2:
-        raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
-    deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
-    centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
-    xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
-    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; 0] u + [w; xi].
-    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
-    return LinearPlant(
-        xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
-        Independent(noises),
-        xp.concatenate(centers),
-        Independent(deviations),
-        xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
-        states=(*plant.states, *renamed.values()),
-        inputs=plant.inputs,
-        circular=(*plant.circular, *(renamed[name] for name in bias.circular)),
-    )
 
 
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
@@ -175,7 +135,7 @@ def with_clocks(
     clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
     dt: "Float[ArrayLike, '']",
-) -> "tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]":
+) -> "tuple[LinearPlant | Plant | Clocked, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
@@ -206,7 +166,7 @@ def with_clocks(
     }
 
 
-def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Clocked:
+def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Plant | Clocked:
     if not isinstance(plant.noise, AbstractNoise):
         raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
     # Independent initial offset and drift of each clock; drift is a random walk.
@@ -223,7 +183,7 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     if isinstance(plant, LinearPlant):
         center = library(start_at).stack([library(start_at).asarray(x) for x in start_at])
         drifting = LinearPlant(move, np.diag(wander), center, np.diag(spread), states=names)
-        return with_bias(plant, np.zeros((len(plant.states), len(move))), drifting)
+        return driven_by(plant, drifting, np.zeros((len(plant.states), len(move))))
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
     xp = library(plant.initial_mean, start_at)

@@ -130,6 +130,7 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
             Section("What to keep in mind", _words(learned)),
             *_before_and_after(learned, drawings),
             *_losses(learned),
+            *_delays(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
                                Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
         ],
@@ -273,6 +274,21 @@ def _losses(learned: Learned) -> list[Section]:
     )
     table = Table(["lost", "law", "numbers", "gain", ""], rows, caption, wordy=True)
     return [Section("How measurements are lost", [table])] if rows else []
+
+
+def _delays(learned: Learned) -> list[Section]:
+    """Describe how late the measurements of events were."""
+    rows = [
+        [visible(node), f"{steps * item.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
+        for node, item in learned.fit.delays.items()
+        for steps, share in item.shares.items()
+    ]
+    caption = (
+        "How long measurements were on their way, in steps, with the probability of each delay and its 95 % interval. "
+        "`delays[node].law` of a fit is the law, for `hg.model.delayed(link, law)`."
+    )
+    table = Table(["node", "seconds late", "probability", "95 %"], rows, caption)
+    return [Section("How late measurements are", [table])] if rows else []
 
 
 def pages(learned: Learned) -> "partial[Page]":

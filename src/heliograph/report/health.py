@@ -123,7 +123,7 @@ def examine(
         white = None
         if item.claim != "none" and item.received:
             white = whitened_innovations(z, item, inputs)
-            outputs += outputs_of(listener, inputs)
+            outputs += outputs_of(listener, record, inputs)
         lags = min(LAGS, len(z) // 10)
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None

@@ -10,9 +10,9 @@ import numpy as np
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
+from heliograph.filters.innovation import InnovationSummary, Weighed, outlying, summarise_innovations
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import STRENGTH, Innovation, weakest
+from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
@@ -120,18 +120,24 @@ def weighs(filter: AbstractFilter) -> bool:
     return innovation.weight is not None
 
 
-def outputs_of(listener: Listener, inputs: np.ndarray) -> list[OutputHealth]:
+def outputs_of(listener: Listener, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
     """Summarise the innovations of one filter that claims a covariance, by output."""
+    known = record.weighed.get(listener.node, {}).get(listener.name)
+    if known is not None:
+        return _health(listener.node, listener.name, listener.outputs, known, True, listener.blames)
     result = listener.filter.run(listener.measurements, inputs)
-    innovation = Innovation(result.innovations, result.innovation_covariances, result.log_likelihoods, result.weights)
-    return _health(listener.node, listener.name, listener.outputs, innovation, listener.blames)
+    variance = np.diagonal(result.innovation_covariances, axis1=-2, axis2=-1)
+    innovations = Weighed(result.innovations, variance, np.ones_like(result.innovations))
+    return _health(listener.node, listener.name, listener.outputs, innovations, False, False)
 
 
-def _health(node: str, name: str, outputs: Sequence[str], innovation: Innovation, blames: bool) -> list[OutputHealth]:
-    summaries = summarise_innovations(innovation)
-    outliers, weighed = outlying(summaries), innovation.weight is not None
+def _health(
+    node: str, name: str, outputs: Sequence[str], innovations: Weighed, weighed: bool, blames: bool
+) -> list[OutputHealth]:
+    summaries = summarise_innovations(innovations)
+    outliers = outlying(summaries) if blames else []
     return [
-        OutputHealth(node, name, output, weighed, weighed and blames and i in outliers, summary)
+        OutputHealth(node, name, output, weighed, i in outliers, summary)
         for i, (output, summary) in enumerate(zip(outputs, summaries, strict=True))
     ]
 
@@ -155,17 +161,16 @@ class RecentOutputs:
         """Summarise each output of each filter over its newest rows."""
         result = []
         for (node, name), rows in self._rows.items():
-            value, variance, weight = np.moveaxis(np.array(rows), 1, 0)
-            covariance = np.einsum("ti,ij->tij", variance, np.eye(value.shape[1]))
-            names = self.names.get((node, name)) or [str(i + 1) for i in range(value.shape[1])]
-            result += _health(node, name, names, Innovation(value, covariance, np.zeros(len(value)), weight), True)
+            innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))
+            names = self.names.get((node, name)) or [str(i + 1) for i in range(innovations.value.shape[1])]
+            result += _health(node, name, names, innovations, True, True)
         return result
 
 
-def weighed_outputs(network: Network, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
-    """Summarise the innovations of all filters that weigh what arrives, by output."""
-    chosen = (item for item in listeners(network, record) if item.filter.received and weighs(item.filter))
-    return [output for item in chosen for output in outputs_of(item, inputs)]
+def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
+    """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
+    chosen = (item for item in listeners(network, record) if item.name in record.weighed.get(item.node, {}))
+    return [output for item in chosen for output in outputs_of(item, record, np.zeros(0))]
 
 
 def output_numbers(health: OutputHealth) -> dict[str, Json]:

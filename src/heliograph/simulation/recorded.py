@@ -198,7 +198,6 @@ def _results(later: Smoother | None, z: tuple[np.ndarray, ...], results: dict[st
     """Return what the filters judged, and their results, smoothed if there is a smoother."""
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    results = {name: part for name, part in results.items() if not name.startswith("weighed")}
     return (results if later is None else later.both(results)) | judged
 
 

@@ -8,19 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, step_with_judgement
+from heliograph.filters.innovation import Weighed
 from heliograph.filters.plausibility import Judgement, Reason
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-
-
-class Weighed(NamedTuple):
-    """Innovation of a filter that weighs, by component: value, variance and weight (m,) each."""
-
-    value: jax.Array
-    variance: jax.Array
-    weight: jax.Array
 
 
 class StepOutput(NamedTuple):
@@ -51,12 +44,15 @@ def filter_step(
     the state before it stays.
     """
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
-    # With a smoother step, a judgement, or neither.
-    if smooths:
-        judgement = filter.step_judged(state, z, u, k)[2] if judges else None
-        after, steps = filter.step_with_smoother(state, z, u, k)
-        return after, StepOutput(filter.after_step(after, k), steps, judgement)
+    # With a smoother step, and a judgement of the same step.
     judgement, weighed = None, None
+    if smooths:
+        if judges:
+            *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)
+            weighed = weighed_in(innovation)
+        after, steps = filter.step_with_smoother(state, z, u, k)
+        return after, StepOutput(filter.after_step(after, k), steps, judgement, weighed)
+    # With a judgement, or alone.
     if judges:
         after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
         weighed = weighed_in(innovation)

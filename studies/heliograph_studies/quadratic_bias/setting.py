@@ -9,7 +9,7 @@ import heliograph as hg
 from heliograph.model import OverTime, over_time, with_bias
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.random_affine import FiniteSupport, GainAndNoise, Independent, Shaped
@@ -129,11 +129,11 @@ def plant(horizon: int, noise: Noises) -> OverTime:
     bias = hg.LinearPlant(F, drive, np.zeros(2), start, states=("eps1", "eps2"))
     shaped = Shaped(B, noise.w.law())
 
-    def at_time(t: int) -> hg.LinearPlant:
+    def at_time(t: int) -> AbstractPlant:
         matrix = [[0.6, 0.5], [-0.1 * np.sin(0.2 * t), 0.8]]
         coupling = [[0.1, 0.0], [0.03 * np.cos(0.2 * t), 0.15]]
         state = hg.LinearPlant(matrix, shaped, np.zeros(2), INITIAL_VARIANCE * np.eye(2), states=("x1", "x2"))
-        return with_bias(state, coupling, bias)
+        return with_bias(state, hg.LinearSensor(C, 0.0), bias, coupling=coupling)[0]
 
     return over_time([at_time(t) for t in range(horizon)])
 
@@ -159,7 +159,7 @@ def shock(size: float, probability: float) -> FiniteSupport:
     return TwoValues(size * (1 - probability), -size * probability, probability).law()
 
 
-def outage_parts(outages: Outages) -> tuple[hg.LinearPlant, hg.LinearSensor, Channel]:
+def outage_parts(outages: Outages) -> tuple[AnyPlant, AnySensor, Channel]:
     """x+ = 0.9 x + 0.3 bias + w with rare large shocks w, bias+ = 0.8 bias + xi; y = x + v; two links that are off."""
     drive, start = TwoValues(-0.1, 0.1, 0.5).law(), TwoValues(-0.3, 0.3, 0.5).law()
     bias = hg.LinearPlant([[0.8]], drive, [0.0], start, states=("bias",))
@@ -169,4 +169,6 @@ def outage_parts(outages: Outages) -> tuple[hg.LinearPlant, hg.LinearSensor, Cha
         GainAndNoise(hg.Discrete([0.0, 1.0], [off, 1 - off]), np.eye(1), shock(1.0, 0.1))
         for off in (outages.sensor_off, outages.relay_off)
     ]
-    return with_bias(state, [[0.3]], bias), hg.LinearSensor([[1.0, 0.0]], shock(1.0, 0.1)), hg.amplify_and_forward(hops)
+    return *with_bias(state, hg.LinearSensor([[1.0]], shock(1.0, 0.1)), bias, coupling=[[0.3]]), hg.amplify_and_forward(
+        hops
+    )

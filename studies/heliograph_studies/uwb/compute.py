@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.filters.innovation import InnovationSummary, outlying, summarise_innovations
-from heliograph.model.estimate import Innovation
+from heliograph.filters.innovation import InnovationSummary, Weighed, outlying, summarise_innovations
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
 from heliograph_studies.uwb.drives import Drive, drives
@@ -107,8 +106,7 @@ def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     error = off(read.time - numbers.late, place)
     ahead = place + numbers.late * np.gradient(place, np.maximum.accumulate(read.time), axis=0)
     squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[used]), error)
-    sizes = np.einsum("ti,ij->tij", variance, np.eye(variance.shape[1]))
-    summaries = summarise_innovations(Innovation(innovation, sizes, np.zeros(len(innovation)), weight))
+    summaries = summarise_innovations(Weighed(innovation, variance, weight))
     return Rule(
         _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],
         np.sqrt(np.trace(covariance[used], axis1=1, axis2=2)), np.linalg.norm(error, axis=1), weight[used],

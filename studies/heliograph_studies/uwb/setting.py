@@ -142,7 +142,7 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
 
     sensor: Any = hg.Sensor(ranges, law_of(rule, numbers, count), outputs=[f"range{i}" for i in range(count)])
     if errors := errors_of(rule, numbers, count):
-        plant, sensor = hg.model.with_sensor_bias(plant, sensor, errors.deviation, errors.time, "dt", errors.ranges)
+        plant, sensor = hg.model.with_bias(plant, sensor, errors.deviation, errors.time, "dt", loading=errors.ranges)
     if rule == "plain":
         return hg.extended_filter(plant, sensor, hg.perfect(count))
     return hg.robust_filter(plant, sensor, hg.perfect(count), weights_of(rule, numbers), hg.filters.Linearization())

@@ -247,6 +247,7 @@ def test_a_combination_free_of_noise_is_known(noise):
             assert np.abs(record.errors("a", name)).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
     """d P+ / d N at N = 0 of a combination without noise, against a difference of second order in 1e-5: 1e-4."""
     plant = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0)

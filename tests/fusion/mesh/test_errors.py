@@ -63,6 +63,7 @@ def test_best_weights_are_no_worse_than_any_other_of_one_step(lossy):
     assert all(result["best"][0] <= item[0] * (1 + 1e-7) for item in result.values())
 
 
+@pytest.mark.slow
 def test_where_everybody_receives_everybody_every_node_is_the_central_filter():
     whole = network(RULES, EVERYBODY)
     for name in ("best", "diagonal", "equal", "trace"):
@@ -206,6 +207,7 @@ def test_frozen_best_weights_claim_what_they_err():
     assert ratio == pytest.approx(np.ones(4), abs=0.1)  # means over 40 and 60 steps of losses
 
 
+@pytest.mark.slow
 def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
     """A recording takes them for some rows at a time by native code, a run at each step by XLA."""
     net = network({"d": hg.fusion.DiagonalWeights(), "m": hg.fusion.MatrixWeights()}, link=LINK)

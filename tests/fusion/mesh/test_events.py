@@ -18,7 +18,11 @@ def with_events(alphas, rule, link=None):
     return hg.Network(PLANT, plain.nodes, fused)
 
 
-@pytest.fixture(scope="module", params=["nothing", "independent", "bursts"])
+def daily(name):
+    return pytest.param(name, marks=[] if name == "independent" else pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=map(daily, ["nothing", "independent", "bursts"]))
 def record(request):
     bursts = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.2), 0.1, 0.4)
     link = {"nothing": None, "independent": hg.erasure(hg.perfect(), 0.7), "bursts": bursts}[request.param]

@@ -130,6 +130,7 @@ def fusion(rule=None, neighbours=None, **rest):
     return hg.Fusion("own", rule or hg.CovarianceIntersection(), neighbours=neighbours or {"a": ["b"]}, **rest)
 
 
+LAW = hg.Discrete([0.0, 1.0], [0.5, 0.5])
 STRANGER = {"a": {"c": 1.0}}
 SHARES = {"a": {"b": 0.7, "a": 0.7}}
 BAD = {
@@ -156,9 +157,22 @@ BAD = {
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.dropout(hg.perfect(), 0.8))}),
         "link between neighbours: expected messages that arrive as they are",
     ),
-    "a late link": (
-        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.model.delayed(hg.perfect(), 1))}),
-        "link between neighbours: expected",
+    "delays that nobody knows": (
+        lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.model.delayed(hg.perfect(), LAW))}),
+        "link between neighbours: expected delays that the receiver knows",
+    ),
+    "best weights of what comes late": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()},
+            {"m": fusion(hg.fusion.MatrixWeights(), link=hg.model.delayed(hg.perfect(), 1))}
+        ),
+        "expected a rule that intersects, where there are messages that come late",
+    ),
+    "events of what comes late": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.model.delayed(hg.perfect(), 1), alpha=0.1)}
+        ),
+        "expected one round without events, where messages come late or quantized, got events",
     ),
     "a noisy link": (
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.hop(1.0, 0.1))}),
@@ -196,9 +210,21 @@ BAD = {
         "expected one round",
     ),
     "no rounds": (lambda: fusion(rounds=0), "rounds of a fusion: expected a positive whole number"),
-    "a quantizer": (
-        lambda: fusion(quantizer=hg.fusion.UniformQuantizer(4, 1.0)), "messages that arrive as they are or not at all"
+    "best weights of what is quantized": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()},
+            {"m": fusion(hg.fusion.DiagonalWeights(), quantizer=hg.fusion.UniformQuantizer(4, 1.0))}
+        ),
+        "expected a rule that intersects, where there are quantizers",
     ),
+    "a quantizer that remembers": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()},
+            {"m": fusion(quantizer=hg.fusion.EscapeQuantizer(5, 1.0, 0.5, 0.5, 0.1))}
+        ),
+        "quantizer between neighbours: expected one with a bound on its error",
+    ),
+    "an uplink": (lambda: fusion(uplink=hg.fusion.ReportLink()), "expected a link of each edge"),
     "links without neighbours": (
         lambda: hg.Fusion("own", hg.CovarianceIntersection(), link=LINK), "expected neighbours"
     ),

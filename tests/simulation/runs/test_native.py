@@ -86,7 +86,13 @@ def inputs(name: str) -> np.ndarray | None:
     return INPUTS[:HORIZON] if name == "quantized" else None
 
 
-@pytest.fixture(params=NETWORKS)
+def daily(*names: str) -> pytest.MarkDecorator:
+    """Every network: these each day, all others in `make check`."""
+    parts = [name if name in names else pytest.param(name, marks=pytest.mark.slow) for name in NETWORKS]
+    return pytest.mark.parametrize("networked", parts, indirect=True)
+
+
+@pytest.fixture
 def networked(request: pytest.FixtureRequest) -> tuple[hg.Network, np.ndarray | None]:
     return NETWORKS[request.param](), inputs(request.param)
 
@@ -96,6 +102,7 @@ def by(engine: str, monkeypatch: pytest.MonkeyPatch, *args: object, **kwargs: ob
     return hg.monte_carlo(*args, **kwargs)
 
 
+@daily("linear", "shadowed")
 def test_records_are_those_of_xla(networked, monkeypatch):
     """Draws to the last bits, estimates to 1e-12 of what deviates from step to step."""
     network, u = networked
@@ -113,6 +120,7 @@ def test_records_are_those_of_xla(networked, monkeypatch):
             assert item.claim == true.claim
 
 
+@daily("with memory", "shadowed")
 def test_statistics_are_those_of_xla(networked, monkeypatch):
     network, u = networked
     result, expected = (
@@ -129,6 +137,7 @@ def test_statistics_are_those_of_xla(networked, monkeypatch):
             np.testing.assert_array_equal(item.failed, true.failed)
 
 
+@pytest.mark.slow
 def test_smoothed_estimates_are_those_of_xla(monkeypatch):
     """Of nodes whose links lose nothing, and of one whose do; trajectories and their sums."""
     interval = hg.smoothing.FixedInterval()

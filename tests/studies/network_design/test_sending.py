@@ -49,7 +49,8 @@ def test_sensors_that_tell_nothing_are_no_worse_than_their_bound():
     rows, signal = PATHS.rows.copy(), PATHS.signal.copy()
     rows[0, 4], signal[0, 4] = 0.0, 0.0
     blind = choose_sensors(PATHS._replace(rows=rows, signal=signal), 1, 6.0)
-    assert 4 not in blind.chosen and blind.bound >= choose_sensors(PATHS, 1, 6.0).bound
+    # The sender that is left out is in neither choice: bounds are equal, to the rounding of two programs.
+    assert 4 not in blind.chosen and blind.bound >= choose_sensors(PATHS, 1, 6.0).bound * (1 - 1e-12)
 
 
 def test_schedules_of_periods_one_to_four_have_the_printed_errors():

@@ -14,11 +14,12 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
+from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.enlarged import with_bias, with_past
+from heliograph.model.enlarged import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -170,13 +171,13 @@ def with_relays(
     return moved, last, of_line(channel.stages[-1]), tuple(lines)
 
 
-def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
+def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
     """Enlarge the plant by the line of a relay, which shifts by one at each step."""
     held = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
     shift, nothing = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((held, held))
     line = LinearPlant(shift, nothing, np.zeros(held), nothing, states=names)
-    return with_bias(plant, np.zeros((len(plant.states), held)), line)
+    return driven_by(plant, line, np.zeros((len(plant.states), held)))
 
 
 def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:

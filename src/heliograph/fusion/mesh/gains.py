@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.numerics.linalg import add, identity, root, solve, symmetric, symmetrize, times, transpose
+from heliograph.numerics.linalg import add, diagonal, identity, root, solve, symmetric, symmetrize, times, transpose
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Bool, Float
 
@@ -94,3 +94,22 @@ def correct(
     pushed = times(short, left)
     long = add([times(times(innovation, predicted), transpose(innovation)), times(pushed, transpose(pushed))])
     return symmetric(long), innovation
+
+
+@runs_last
+def information_of(
+    gain: jax.Array, noise: jax.Array, used: jax.Array
+) -> tuple[Float[jax.Array, "n m *#runs"], Float[jax.Array, "n n *#runs"]]:
+    """H' R^-1 and H' R^-1 H of the components that are used."""
+    there = used.astype(gain.dtype)
+    h = there[:, None] * gain
+    r = there[:, None] * noise * there[None] + diagonal(1 - there)
+    weighted = transpose(solve(r, h))
+    return weighted, times(weighted, h)
+
+
+def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[jax.Array, "node degree n n"]:
+    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
+    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * jnp.eye(len(matrix))
+    others = (gains.front[:, None] @ parts).at[:, 0].set(0.0)
+    return others.at[:, 0].set(gains.innovation @ matrix - others.sum(axis=1))

@@ -59,12 +59,13 @@ def link(domain: Domain, value: PyTree) -> PyTree:
 
 
 def unlink(domain: Domain, value: PyTree) -> PyTree:
-    """Transform back from that scale; infinite values give the limits."""
-    if np.isfinite(domain.low) and np.isfinite(domain.high):
-        return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
-    if np.isfinite(domain.low):
-        return domain.low + np.exp(value)
-    return domain.high - np.exp(value) if np.isfinite(domain.high) else value
+    """Transform back from that scale; infinite values, and those beyond all numbers, give the limits."""
+    with np.errstate(over="ignore"):
+        if np.isfinite(domain.low) and np.isfinite(domain.high):
+            return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
+        if np.isfinite(domain.low):
+            return domain.low + np.exp(value)
+        return domain.high - np.exp(value) if np.isfinite(domain.high) else value
 
 
 def unlink_slope(domain: Domain, value: PyTree) -> PyTree:

@@ -13,8 +13,10 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike, Bool, PyTree
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.delay import Delayed, sent
 from heliograph.random_affine.erasure import Erasure, arrived
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
@@ -27,13 +29,15 @@ Recorded = Mapping[str, SentReports | ArrayLike]
 class Edges(Module):
     """All edges of a fusion between neighbours; none of them loses anything where there are no groups.
 
-    `slots` (edge,) are the places of their flags among those of all (node, degree).
+    `slots` (edge,) are the places of their flags among those of all (node, degree). Where messages may be `past` steps
+    late, a flag is the age of the message that arrives, -1 where none does.
     """
 
     groups: tuple[ChannelGroup, ...]
     slots: np.ndarray
     present: np.ndarray
     rounds: int = eqx.field(static=True)
+    past: int = eqx.field(static=True, default=0)
 
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
         """Return the states of the channels before the first step."""
@@ -44,18 +48,23 @@ class Edges(Module):
         return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
 
     def draw(self, states: tuple[PyTree, ...], key: jax.Array, k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
-        """Draw what arrives at step k in each round: next states, and flags (node, rounds, degree)."""
+        """Draw what arrives at step k in each round: next states, and flags or ages (node, rounds, degree)."""
         rounds = []
         # One exchange after another, each with its draws; channels with memory go on from one to the next.
         for number in range(self.rounds):
-            flags, following = jnp.asarray(self.present), []
+            flags, following = jnp.asarray(self.lossless()[:, 0]), []
             for group, state in zip(self.groups, states, strict=True):
 
                 def single(item: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
                     channel = at(item.channel, k)
-                    sent = jnp.zeros(channel.inputs)
-                    state, z = deliver(channel, state, sent, key, count, item.checksums, item.memories)
-                    return state, ~jnp.any(jnp.isnan(z))
+                    state, z = deliver(channel, state, jnp.zeros(sent(channel)), key, count, item.checksums,
+                                       item.memories)  # fmt: skip
+                    arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
+                    if not self.past:
+                        return state, arrives
+                    # Nothing was sent before the first step.
+                    age = 0 if late is None else z[-1].astype(int) if late.timestamped else late.times[0]
+                    return state, jnp.where(arrives & (age <= count), age, -1)
 
                 # All channels of one kind at once; their flags go to the places of the edges.
                 both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, None))
@@ -66,14 +75,19 @@ class Edges(Module):
             rounds.append(flags)
         return states, jnp.stack(rounds, axis=1)
 
-    def lossless(self) -> Bool[np.ndarray, "node rounds degree"]:
-        """Flags of a step at which everything arrives."""
-        return np.repeat(self.present[:, None], self.rounds, axis=1)
+    def lossless(self) -> Bool[np.ndarray, "node rounds degree"] | Int[np.ndarray, "node rounds degree"]:
+        """Flags of a step at which everything arrives at once."""
+        module = library(self.present)
+        flags = module.where(self.present, 0, -1) if self.past else self.present
+        result: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)
+        return result
 
     def recorded(
         self, name: str, nodes: Sequence[str], reports: Recorded | None, steps: int
     ) -> Bool[np.ndarray, "time node rounds degree"]:
         """Flags of each step from a recording, (steps, rounds times neighbours) for each node that has neighbours.
+
+        Of late messages their ages in steps.
 
         Raises:
             ValueError: nodes without flags or the reverse, shapes that do not fit.
@@ -93,7 +107,12 @@ class Edges(Module):
             count = int(self.present[i, 1:].sum())
             values = array(f"reports of node {node!r}", item.values if isinstance(item, SentReports) else item,
                            (steps, self.rounds * count), missing=True)  # fmt: skip
-            result[:, i, :, 1 : count + 1] = ~np.isnan(values.reshape(steps, self.rounds, count))
+            values = values.reshape(steps, self.rounds, count)
+            if self.past and not np.isin(values[~np.isnan(values)], np.arange(self.past + 1)).all():
+                expected = f"ages of what arrives, from 0 to {self.past} steps, NaN where nothing does"
+                raise fail(f"reports of node {node!r}", expected, "other numbers")
+            ages = np.where(np.isnan(values), -1, values).astype(int)
+            result[:, i, :, 1 : count + 1] = ages if self.past else ages >= 0
         return result
 
 
@@ -114,19 +133,36 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
     for channel in {id(c): c for c in channels}.values():
         check_edge(channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
-    return Edges(channel_groups(dict(zip(names, channels, strict=True))), slots, graph.present, fusion.rounds)
+    groups, past = channel_groups(dict(zip(names, channels, strict=True))), max(first(c).past for c in channels)
+    return Edges(groups, slots, graph.present, fusion.rounds, past)
 
 
 def check_edge(link: Channel) -> None:
-    """Refuse a link that delays, changes or quantizes a message, and losses that the receiver does not know of."""
+    """Refuse a link that changes a message, and losses or delays that the receiver does not know of."""
     instance("link between neighbours", first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for item in unstack(link):
-        for part in item.maps if isinstance(item, Modes) else [item]:
-            while isinstance(part, Erasure):
-                part = part.base
+        late = late_part(item)
+        if late is not None and not (late.constant or late.timestamped):
+            raise fail("link between neighbours", "delays that the receiver knows (timestamped=True)", "others")
+        inside = _without_losses(item)
+        inside = inside if late is None else _without_losses(late.link)
+        for part in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
             if part.remembers or part.past or not _is_perfect(part):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail("link between neighbours", expected, type(first(link)).__name__)
+
+
+def late_part(channel: AbstractRandomAffine) -> Delayed | None:
+    """Return the delay of a link, whose messages may also be lost; None of one without."""
+    inside = _without_losses(channel)
+    return inside if isinstance(inside, Delayed) else None
+
+
+def _without_losses(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    """Return the link for messages that are not lost."""
+    while isinstance(channel, Erasure):
+        channel = channel.base
+    return channel
 
 
 def arrival_chance(channel: Channel | None) -> float | None:

@@ -10,20 +10,21 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
 from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of, transitions
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at
+from heliograph.model.over_time import at, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import diagonal, solve, symmetrize, times, transpose
+from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
-from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
 from heliograph.simulation.centres.edges import Edges, edges_of
+from heliograph.simulation.centres.messages import Messages, OnTheWay, messages_of, moved_beyond, one_step_on
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -37,7 +38,7 @@ class MeshState(NamedTuple):
 
     Shapes: mean (node, n), covariance (node, n, n); joint (node, n, node, n) covariance of all errors, None where the
     rule does without; plant: mean (n,) and covariance (n, n) of the state; sent (node, degree, n): estimates of its
-    neighbours that each node received last, predicted, where not all are sent.
+    neighbours that each node received last, predicted, where not all are sent; way: messages that may arrive later.
     """
 
     mean: Float[jax.Array, "node n"]
@@ -45,6 +46,7 @@ class MeshState(NamedTuple):
     joint: Float[jax.Array, "node n node n"] | None
     plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
     sent: Float[jax.Array, "node degree n"] | None
+    way: OnTheWay | None
 
 
 class Data(NamedTuple):
@@ -97,6 +99,7 @@ class Mesh(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
     alpha: float | None = eqx.field(static=True)
+    quantizer: AbstractQuantizer | None
     needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
@@ -108,7 +111,11 @@ class Mesh(Module):
         joint = jnp.broadcast_to(covariance[None, :, None], (nodes, n, nodes, n)) if self.needs_joint else None
         sent = None if self.alpha is None else jnp.tile(mean, (*self.senders.shape, 1))
         both = jnp.tile(mean, (nodes, 1)), jnp.tile(covariance, (nodes, 1, 1))
-        return MeshState(*both, joint, (mean, covariance), sent)
+        way = None
+        if self.edges.past or self.quantizer is not None:
+            ages = self.edges.past
+            way = OnTheWay(jnp.tile(mean, (ages, nodes, 1)), jnp.tile(covariance, (ages, nodes, 1, 1)))
+        return MeshState(*both, joint, (mean, covariance), sent, way)
 
     def step(
         self, state: MeshState, z: Sequence[jax.Array], arrived: Arrived,
@@ -120,20 +127,23 @@ class Mesh(Module):
         """
         there = jnp.concatenate([self._rows(part) for part in z])[self.observation_model.order]
         blocks, present = self.blocks(state.joint), ~jnp.isnan(there)
-        parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead)
+        messages = self._messages(state, jnp.asarray(arrived))
+        arrived = arrived if messages is None else messages.fresh
+        parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
         gains, motion = parts.gains, parts.motion
         # All rounds but the last only intersect.
         mean = state.mean
         for weights in parts.exchanges:
             mean = mean + self._pulled(weights.front, weights.parts, mean, mean[self.senders])
-        sent = self._sent(mean, state, jnp.asarray(arrived[:, -1]))
+        sent = self._sent(mean, state, jnp.asarray(arrived[:, -1]), messages)
         mean = mean[self.senders[:, 0]]  # of the nodes that are stepped
         # Innovations about one common prediction, so that no digits of the means themselves are lost.
         predicted = mean @ motion.matrix.T + motion.shift
         common = jnp.mean(predicted, axis=0)
         observation = parts.data.observation
         off = jnp.where(present, there - observation.offset - observation.gain @ common, 0.0)
-        sums = self._collected(jnp.einsum("inm,im->in", parts.data.weighted, off), arrived)
+        weighted = jnp.einsum("inm,im->in", parts.data.weighted, off)
+        sums = self._collected(weighted, arrived)
         # xhat+ = A xhat + b + sum M_j (xhat_j - xhat) + W (s - S (A xhat + b)).
         innovation = sums - jnp.einsum("iab,ib->ia", parts.information, predicted - common)
         pulled = self._pulled(gains.front, gains.parts, mean, sent)
@@ -142,35 +152,37 @@ class Mesh(Module):
         joint = None if state.joint is None else self._moved(state.joint, parts, jnp.asarray(arrived[:, -1]))
         claimed = gains.covariance if joint is None else jnp.einsum("iaib->iab", joint)
         held = None if state.sent is None else sent @ motion.matrix.T + motion.shift
-        return MeshState(mean, gains.covariance, joint, parts.plant, held), self._by_group(mean, claimed)
+        after = MeshState(mean, gains.covariance, joint, parts.plant, held, None)
+        if messages is not None and state.way is not None:
+            on = one_step_on(messages, state.way, motion, common, weighted, parts.data.information)
+            after = after._replace(way=on)
+        return after, self._by_group(mean, claimed)
 
-    def _sent(self, mean: jax.Array, state: MeshState, arrives: jax.Array) -> Float[jax.Array, "node degree n"]:
-        """Estimates that the nodes have of their neighbours: those of now, or with events what they received last.
+    def _messages(self, state: MeshState, arrived: jax.Array) -> Messages | None:
+        """Messages that are no estimates of now as they are; None where all are."""
+        if state.way is None:
+            return None
+        ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
+        return messages_of(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
-        A node sends where (xhat - xs)' P^-1 (xhat - xs) > alpha n for the xs of anybody who may receive it; where its
-        message arrives, the error of xs is then at most (1 + sqrt(alpha n))^2 P, whatever got lost before:
-        E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
-        """
+    def _sent(
+        self, mean: jax.Array, state: MeshState, arrives: jax.Array, messages: Messages | None
+    ) -> Float[jax.Array, "node degree n"]:
+        """Estimates that the nodes have of their neighbours: those of now, or what they received last or late."""
+        if messages is not None:
+            return messages.mean[messages.senders]
         now = mean[self.senders]
         if state.sent is None or self.alpha is None:
             return now
-        off, information = now - state.sent, jax.vmap(inverse)(state.covariance)
-        far = jnp.einsum("ida,idab,idb->id", off, information[self.senders], off) > self.alpha * off.shape[-1]
-        moving = (far & self.edges.present).astype(int)[:, 1:]  # for others
-        moved = jnp.zeros(len(mean), dtype=int).at[self.senders[:, 1:]].max(moving)
-        return jnp.where((arrives & (moved[self.senders] > 0))[..., None], now, state.sent)
+        information = jax.vmap(inverse)(state.covariance)[self.senders]
+        moved = moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
+        return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
     def parts(
-        self,
-        covariance: Float[Array, "node n n"],
-        blocks: Float[Array, "node degree n degree n"] | None,
-        moments: tuple[Array, Array],
-        there: Bool[Array, "node m"],
-        arrived: Arrived,
-        u: Array,
-        k: Array,
-        ahead: Ahead = (),
-    ) -> Parts:
+        self, covariance: Float[Array, "node n n"], blocks: Float[Array, "node degree n degree n"] | None,
+        moments: tuple[Array, Array], there: Bool[Array, "node m"], arrived: Arrived, u: Array, k: Array,
+        ahead: Ahead = (), messages: Messages | None = None,
+    ) -> Parts:  # fmt: skip
         """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
         covariance, there, arrived, u = (jnp.asarray(part) for part in (covariance, there, arrived, u))
         held = None if blocks is None else jnp.asarray(blocks)
@@ -186,7 +198,10 @@ class Mesh(Module):
         data = self._data(self.observation_model.observe(*after, jnp.asarray(k)), there)
         information = self._collected(data.information, arrived)
         complete = self.sum_of(data.complete, jnp.asarray(self.edges.present))
-        gains = self.gains(covariance, held, arrived[:, -1], motion, information, complete, ahead)
+        arrives, senders = arrived[:, -1], None
+        if messages is not None:
+            covariance, senders, arrives = messages.covariance, messages.senders, messages.arrives[:, -1]
+        gains = self.gains(covariance, held, arrives, motion, information, complete, ahead, senders)
         return Parts(motion, after, tuple(exchanges), data, information, gains)
 
     def _rows(self, z: jax.Array) -> Float[jax.Array, "node m"]:
@@ -206,8 +221,8 @@ class Mesh(Module):
         """Messages about what was measured, and about what would be if no component were missing."""
         real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
         gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
-        weighted, information = jax.vmap(_message)(gain, noise, real & there)
-        complete = jax.vmap(_message)(gain, noise, real)[1]
+        weighted, information = jax.vmap(information_of)(gain, noise, real & there)
+        complete = jax.vmap(information_of)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
 
     def blocks(self, joint: jax.Array | None) -> jax.Array | None:
@@ -225,6 +240,7 @@ class Mesh(Module):
         present: jax.Array,
         *rest: jax.Array,
         ahead: Ahead = (),
+        senders: Array | None = None,
     ) -> PyTree:
         """Apply a function of rule, what a node believes, and more by node, to all nodes side by side."""
         information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
@@ -232,7 +248,7 @@ class Mesh(Module):
         results = []
         for part, known in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = part.rows, part.width
-            theirs = self.senders[rows, :width]
+            theirs = (self.senders if senders is None else senders)[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
             item = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
             if self.alpha is not None:  # what was sent last errs by more than the estimate
@@ -264,15 +280,9 @@ class Mesh(Module):
         return result
 
     def gains(
-        self,
-        covariance: jax.Array,
-        blocks: jax.Array | None,
-        present: jax.Array,
-        motion: Motion,
-        information: jax.Array,
-        complete: jax.Array,
-        ahead: Ahead = (),
-    ) -> Gains:
+        self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
+        information: jax.Array, complete: jax.Array, ahead: Ahead = (), senders: Array | None = None,
+    ) -> Gains:  # fmt: skip
         """Gains of all nodes."""
 
         def single(
@@ -283,7 +293,8 @@ class Mesh(Module):
                 return gains_of(Weights(jnp.eye(len(motion.shift)), *known), step)
             return rule.neighbour_gains(item, step)
 
-        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete, ahead=ahead)
+        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete,
+                                         ahead=ahead, senders=senders)  # fmt: skip
         return result
 
     def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
@@ -296,7 +307,7 @@ class Mesh(Module):
         """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
         gains, motion = parts.gains, parts.motion
         nodes, n = len(self.senders), len(motion.shift)
-        m = self._spread(transitions(gains, motion))
+        m = self._spread(transitions(gains, motion.matrix))
         k = self._spread(jnp.where(present[:, :, None, None], gains.gain[:, None], 0.0))
         f = gains.innovation.reshape(nodes * n, n)
         weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), parts.data.information).reshape(k.shape)
@@ -326,25 +337,6 @@ def _weights(rule: AbstractFusion, item: Believed, *_: PyTree) -> Weights:
 def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
     """Fill rows with zeros up to the longest."""
     return jnp.pad(parts, ((0, 0), (0, degree - parts.shape[1]), *[(0, 0)] * (parts.ndim - 2)))
-
-
-def transitions(gains: Gains, motion: Motion) -> Float[jax.Array, "node degree n n"]:
-    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
-    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * jnp.eye(len(motion.shift))
-    others = (gains.front[:, None] @ parts).at[:, 0].set(0.0)
-    return others.at[:, 0].set(gains.innovation @ motion.matrix - others.sum(axis=1))
-
-
-@runs_last
-def _message(
-    gain: jax.Array, noise: jax.Array, used: jax.Array
-) -> tuple[Float[jax.Array, "n m *#runs"], Float[jax.Array, "n n *#runs"]]:
-    """H' R^-1 and H' R^-1 H of the components that are used."""
-    there = used.astype(gain.dtype)
-    h = there[:, None] * gain
-    r = there[:, None] * noise * there[None] + diagonal(1 - there)
-    weighted = transpose(solve(r, h))
-    return weighted, times(weighted, h)
 
 
 def mesh_of(network: Network, name: str) -> Mesh:
@@ -380,6 +372,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         places=tuple(mine),
         nodes=graph.nodes,
         alpha=fusion.alpha,
+        quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],
     )

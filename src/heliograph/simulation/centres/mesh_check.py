@@ -1,6 +1,7 @@
 """Checks of a fusion between neighbours when its network is made, and its claim."""
 
 import warnings
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,12 +10,13 @@ from scipy.sparse.csgraph import maximum_flow
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
@@ -54,7 +56,7 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
             raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
     _check_rule(what, fusion, network)
     graph = graph_of(neighbours, network.mesh_nodes(name))
-    edges_of(fusion, graph)
+    _check_messages(what, fusion, network, graph)
     fusion.rule.placed(graph)
     mesh_claim(name, fusion, network)
     _check_seen(what, name, fusion, network)
@@ -97,6 +99,25 @@ def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
     singular = np.any(scale == 0) or np.linalg.eigvalsh(start / np.outer(scale, scale))[0] < RANK
     if singular and not rule.needs_joint and not isinstance(rule, FrozenWeights):
         raise fail(f"{what} by {kind.__name__}", "a regular initial covariance of the plant", "a singular one")
+
+
+def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+    """Refuse links that do not serve, and delays and quantizers where no bound is known then."""
+    past, kind = edges_of(fusion, graph).past, type(fusion.rule).__name__
+    if not past and fusion.quantizer is None:
+        return
+    expected = f"a rule that intersects, where there are {'messages that come late' if past else 'quantizers'}"
+    if fusion.rule.needs_joint or isinstance(fusion.rule, FrozenWeights):
+        raise fail(f"{what} by {kind}", expected, kind)
+    if fusion.rounds > 1 or fusion.alpha is not None:
+        expected = "one round without events, where messages come late or quantized"
+        raise fail(what, expected, "events" if fusion.rounds == 1 else f"{fusion.rounds} rounds")
+    if fusion.quantizer is not None:
+        fusion.check(graph.nodes, len(network.states))
+        several = fusion.quantizer.values() if isinstance(fusion.quantizer, Mapping) else [fusion.quantizer]
+        for item in several:
+            instance("quantizer between neighbours", item, UniformQuantizer, "one with a bound on its error whatever "
+                     "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
 
 def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> None:

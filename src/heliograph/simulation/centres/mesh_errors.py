@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
+from heliograph.fusion.mesh.gains import transitions
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim
@@ -17,7 +18,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
-from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of, transitions
+from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of
 from heliograph.simulation.network import Network
 
 SPARSE = 2000  # nodes whose joint covariance fits in memory
@@ -101,9 +102,12 @@ def mesh_errors(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), for all pairs of a graph.
     """
     mesh = mesh_named(network, fusion)
-    if mesh.alpha is not None:
-        raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step",
-                   f"alpha {mesh.alpha:g}, by which it depends on data what is sent")  # fmt: skip
+    if mesh.alpha is not None or mesh.quantizer is not None:
+        by_data = (
+            "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which it depends on data what is sent"
+        )
+        raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step, as they are",
+                   by_data)  # fmt: skip
     flags = _flags(mesh, arrived)
     network.check_horizon(len(flags))
     u = inputs_of(network, inputs, len(flags))
@@ -156,7 +160,7 @@ def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> n
         joint = congruence(spread(mesh, held, mesh.edges.present), joint)
     # M J M'.
     with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, motion))))
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, motion.matrix))))
     result = congruence(spread(mesh, m, mesh.edges.present), joint)
     # F Q F', and K_il R_l K_jl' = W_i S_l W_j' over the measurements that both have.
     f = np.asarray(gains.innovation).reshape(nodes * n, n)
@@ -327,6 +331,8 @@ def mesh_named(network: Network, fusion: str) -> Mesh:
 
 def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
     """Flags of each step, all of them where a number of steps is given."""
+    if mesh.edges.past:
+        raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")
     shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])
     if isinstance(arrived, int | np.integer) and not isinstance(arrived, bool):
         return np.repeat(mesh.edges.lossless()[None], check_count("number of steps", arrived), axis=0)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.mesh.gains import Gains
+from heliograph.fusion.mesh.gains import Gains, transitions
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
@@ -25,7 +25,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.edges import arrival_chance
-from heliograph.simulation.centres.mesh import Mesh, Parts, Rows, transitions
+from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
 from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
 from heliograph.simulation.network import Network
 
@@ -118,7 +118,7 @@ def _mean(
 
     # Gains of every pattern, M_i with the node itself first.
     with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion))))
+        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion.matrix))))
     f, w = np.asarray(gains.innovation), np.where(patterns.present[:, :, None, None], gains.gain[:, None], 0.0)
     # Different receivers: products of means.
     result = congruence(spread(mesh, mean(m), mesh.edges.present), joint)

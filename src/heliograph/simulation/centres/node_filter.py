@@ -112,8 +112,9 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     if item.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
                    type(item.rule).__name__)  # fmt: skip
-    if item.rounds > 1 or item.alpha is not None:
-        raise fail(what, "one exchange a step", "several rounds" if item.rounds > 1 else "events")
+    if item.rounds > 1 or item.alpha is not None or item.quantizer is not None:
+        different = "several rounds" if item.rounds > 1 else "a quantizer" if item.alpha is None else "events"
+        raise fail(what, "one exchange a step", different)
     # The node's row of the graph: itself, then its neighbours.
     graph, neighbours = graph_of(item.neighbours or {}, nodes), item.neighbours or {}
     i, count = nodes.index(node), 1 + len(neighbours[node])
@@ -132,6 +133,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         places=((0,),),
         nodes=names,
         alpha=None,
+        quantizer=None,
         needs_joint=False,
         claim=network.claims()[node][fusion],
     )

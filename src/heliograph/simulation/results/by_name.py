@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from heliograph.filters.innovation import Weighed
 from heliograph.fusion.rules import Fusion
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
@@ -31,13 +32,14 @@ def reports_by_name(
 
 
 def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
-    """Messages that arrived from each node's neighbours, 1 or NaN (..., rounds times neighbours), and no delays."""
+    """Messages that arrived from each node's neighbours, 1 (or their ages) or NaN (..., rounds times neighbours)."""
     neighbours = network.meshes[name].neighbours or {}
     result = {}
     for i, node in enumerate(network.mesh_nodes(name)):
         if count := len(neighbours[node]):
             flags = arrived[..., i, :, 1 : count + 1]
-            values = np.where(flags, 1.0, np.nan).reshape(*flags.shape[:-2], -1)
+            ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
+            values = ages.reshape(*flags.shape[:-2], -1)
             result[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return result
 
@@ -59,6 +61,17 @@ def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[st
         for group, node_group in groups.items()
         for i, name in enumerate(network.groups[int(group)])
     }
+
+
+def weighed_of(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
+    """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
+    parts = batch.get("weighed", ())
+    result: dict[str, dict[str, Weighed]] = {}
+    for (node, name), (kind, f, i) in network.places().items() if parts else ():
+        if parts[kind] is not None:
+            result.setdefault(node, {})[name] = Weighed(*(np.asarray(part)[:, f, i] for part in parts[kind]))
+    central = {name: item for name, item in batch.get("weighed_centrally", {}).items() if item is not None}
+    return result | ({FUSED: central} if central else {})
 
 
 def by_name(

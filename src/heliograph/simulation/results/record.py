@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.filters.innovation import InnovationSummary, Weighed, summarise_innovations
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -41,10 +42,13 @@ if TYPE_CHECKING:  # extras
 RECORD = "heliograph record"  # the title of a dataset that holds one
 
 
+Array = TypeAliasType("Array", np.ndarray)
+Units = TypeAliasType("Units", dict[str, str])  # by name
 ByNode = TypeAliasType("ByNode", dict[str, np.ndarray])
 Uplinks = TypeAliasType("Uplinks", dict[str, Uplink])  # by fusion
 Estimates = TypeAliasType("Estimates", dict[str, dict[str, Estimate]])  # by node and filter
 Reports = TypeAliasType("Reports", dict[str, dict[str, SentReports]])  # by fusion and node
+Weights = TypeAliasType("Weights", dict[str, dict[str, Weighed]])  # by node and filter
 
 
 @readable
@@ -64,18 +68,21 @@ class Record(Saved):
         reports: by fusion and node, of each fusion that uses reports.
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
             was sent, negative where it was lost, 0 where it was not sent.
+        weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
+            and their `weight` in the update, (time, received) each; `outputs` summarises them.
     """
 
-    time: np.ndarray
+    time: Array
     states: tuple[str, ...]
-    truth: np.ndarray | None
+    truth: Array | None
     measurements: ByNode
     estimates: Estimates
     uplinks: Uplinks = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
+    units: Units = field(default_factory=dict)
     smoothed: "Record | None" = None
     reports: Reports = field(default_factory=dict)
     transmissions: ByNode = field(default_factory=dict)
+    weighed: Weights = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take the units of states whose names have one; units given apart come first."""
@@ -159,6 +166,21 @@ class Record(Saved):
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
         return nees(np.asarray(self.truth), np.where(sound, np.asarray(estimate.mean), np.nan), claimed)
+
+    def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
+        """Summarise the innovations of a filter that weighs, one output after the other.
+
+        Values received and down-weighted, their share with its interval, mean weight, bias with its interval, and mean
+        d^2, d an innovation in units of its deviation.
+
+        Raises:
+            ValueError: no such filter, one that weighs nothing, or a simulation, whose weights `filter.run` has.
+        """
+        self.check_filter(node, name)
+        if name not in self.weighed.get(node, {}):
+            weighing = [f"{element}/{of}" for element, filters in self.weighed.items() for of in filters]
+            raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
+        return summarise_innovations(self.weighed[node][name])
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: dimensions run, time, node, filter, state, and `other`, which is a state too.
@@ -255,8 +277,7 @@ class Record(Saved):
 
     def apart(self) -> list[str]:
         """Names of the parts that are saved separately."""
-        there = {"reports": bool(self.reports), "transmissions": bool(self.transmissions)}
-        return super().apart() + [name for name, is_there in there.items() if is_there]
+        return super().apart() + [name for name in ("reports", "transmissions", "weighed") if getattr(self, name)]
 
     def plot(
         self,

@@ -19,6 +19,7 @@ from heliograph.simulation.results.by_name import (
     reports_by_name,
     transmissions_of,
     uplinks_by_name,
+    weighed_of,
 )
 from heliograph.simulation.results.record import Record
 
@@ -126,6 +127,7 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         for node, claims in network.claims().items()
     }
     uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
-    sent = transmissions_of(network, batch.get("transmissions", {}))
-    record = Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports)
-    return replace(record, transmissions=sent) if sent else record
+    return Record(
+        time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports,
+        transmissions=transmissions_of(network, batch.get("transmissions", {})), weighed=weighed_of(network, batch),
+    )  # fmt: skip

@@ -1,0 +1,76 @@
+"""Law of the delays of a node's measurements, counted from the times when they were measured and logged."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.filters.innovation import independent_count
+from heliograph.numerics.check import TINY, array, fail, scalar
+from heliograph.numerics.module import readable
+from heliograph.numerics.shares import Share, wilson
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.law import Discrete
+
+DelaysByNode = TypeAliasType("DelaysByNode", Mapping[str, "Delays"])
+
+
+@readable
+@dataclass(frozen=True)
+class Delays:
+    """Delays of measurements in whole steps, each with its probability and 95 % interval.
+
+    Args:
+        step: seconds of a step.
+        counted: number of measurements.
+        early: number of others that were logged more than half a step before they were measured, by clocks that are
+            apart: of these nothing is known.
+        shares: probability of each delay that occurred, by its steps.
+    """
+
+    step: float
+    counted: int
+    early: int
+    shares: Mapping[int, Share]
+
+    @property
+    def law(self) -> Discrete:
+        """The most likely law, for `heliograph.model.delayed(link, law)`."""
+        return Discrete(
+            np.array([float(steps) for steps in self.shares]), np.array([s.estimate for s in self.shares.values()])
+        )
+
+    def __str__(self) -> str:
+        """One line: each delay in seconds with its probability and interval."""
+        shares = [f"{steps * self.step:g} s {s.estimate:.3g} ({s.low:.2g} to {s.high:.2g})"
+                  for steps, s in self.shares.items()]  # fmt: skip
+        early = f"; {self.early} more were logged before they were measured" if self.early else ""
+        return f"late by {', '.join(shares)}, of {self.counted} measurements{early}"
+
+
+def learn_delays(late: "Float[ArrayLike, ' measurements']", step: "Float[ArrayLike, '']") -> Delays:
+    """Learn the law of delays from how late each measurement was logged, in the order of measuring.
+
+    The share of each delay is its most likely probability. Its interval is Wilson's, where N measurements whose
+    neighbours are alike with correlation a count as N (1 - a) / (1 + a): a link is late for a while at a time.
+
+    Args:
+        late: seconds from measuring to logging of each.
+        step: seconds of a step, to whole numbers of which delays are rounded.
+
+    Raises:
+        ValueError: no measurement that was logged after its time, a step that is not positive.
+    """
+    seconds = array("delays", late, (None,))
+    size = float(scalar("step of delays", step, TINY))
+    steps = np.floor(seconds / size + 0.5).astype(np.int64)
+    known = steps[steps >= 0]
+    if not len(known):
+        raise fail("delays", "at least one measurement that was logged after its time", f"{len(steps)} before it")
+    shares = {}
+    for delay in np.unique(known):
+        mine = (known == delay).astype(float)
+        count = independent_count(mine)
+        shares[int(delay)] = wilson(float(mine.mean()) * count, count)
+    return Delays(size, len(known), len(steps) - len(known), shares)

@@ -1,0 +1,185 @@
+"""Biases with a motion of their own as states: they drive a plant, or are errors of its sensor, or both."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs, Plant, matrix_of
+from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
+from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
+from heliograph.numerics.traced import is_traced, is_zero, library, scipy_for
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+
+Biases = TypeAliasType("Biases", Float[ArrayLike, " biases"])  # or one number for all
+OfBiases = TypeAliasType("OfBiases", Float[ArrayLike, "rows biases"])
+
+
+def with_bias(
+    plant: "AbstractPlant",
+    sensor: "AbstractSensor",
+    bias: "LinearPlant | Biases",
+    time: Biases = np.inf,
+    dt: "float | str" = 1.0,
+    coupling: "OfBiases | None" = None,
+    loading: "OfBiases | None" = None,
+) -> "tuple[LinearPlant | Plant, LinearSensor | Sensor]":
+    """Return plant and sensor with a bias b as further states: x+ = f(x, u) + E b + w, y = h(x) + D b + v.
+
+    The bias moves by b+ = F b + xi, and every filter of the result estimates both. By default each output has one and
+    the plant none, E = 0, D = I; with a coupling E the outputs have none. Biases of given deviations are Gauss-Markov
+    processes, F = exp(-dt / T), of the same deviation at all times; of infinite T they are constants. Their states are
+    "OUTPUT_bias", or "bias0", "bias1", ... with a coupling or loading. A state of a plant of b with a name that x has
+    gets the prefix "bias_".
+
+    Args:
+        plant: the plant of x (n states).
+        sensor: its sensor.
+        bias: standard deviation of each bias (biases,), or one for all; or the plant of b, independent of the first,
+            whose inputs are some of its.
+        time: T, in which a bias of a given deviation is forgotten to 1/e, of each (biases,) or of all.
+        dt: time of a step, or the name of the input that says it.
+        coupling: E, how each bias drives the plant (n, biases).
+        loading: D, in which outputs each bias is (outputs, biases).
+
+    Raises:
+        ValueError: a negative deviation, a time that is not positive, another input, shapes that do not fit.
+    Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
+    """
+    instance("plant with a bias", plant, AbstractPlant, "one that does not vary")
+    instance("sensor with a bias", sensor, AbstractSensor, "one that does not vary")
+    n, outputs = len(plant.states), len(sensor.outputs)
+    check_sensor(sensor, n)
+    # E and D; how many biases there are, the first that is known says.
+    alone = coupling is None and loading is None
+    count = len(bias.states) if isinstance(bias, LinearPlant) else outputs if alone else "biases"
+    entering = None if coupling is None else array("coupling of the bias", coupling, (n, count))
+    count = count if entering is None else entering.shape[1]
+    seen: Any = np.eye(outputs) if alone else np.zeros((outputs, count)) if loading is None else loading
+    seen = array("loading of the bias", seen, (outputs, count))
+    entering = np.zeros((n, seen.shape[1])) if entering is None else entering
+    if not isinstance(bias, LinearPlant):
+        named = [f"{name}_bias" for name in sensor.outputs] if alone else [f"bias{i}" for i in range(seen.shape[1])]
+        bias = _gauss_markov(plant, named, bias, time, dt)
+    return driven_by(plant, bias, entering), _biased(sensor, seen, n)
+
+
+def _gauss_markov(
+    plant: AbstractPlant, names: list[str], deviation: ArrayLike, time: ArrayLike, dt: ArrayLike | str
+) -> LinearPlant:
+    """Gauss-Markov processes: b+ = a b + xi, a = exp(-dt / T), Var xi = (1 - a^2) deviation^2."""
+    count = len(names)
+    sizes = [scalar("deviation of a bias", x, 0.0) for x in _of_each("deviation of a bias", deviation, count)]
+    rates = [_rate(x) for x in _of_each("time of a bias", time, count)]
+    size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (sizes, rates))
+    # With a step that is a number, or as functions of the input that says it.
+    xp = library(size, rate)
+    start, center = xp.diag(size**2), np.zeros(count)
+    if not isinstance(dt, str):
+        step = scalar("time of a step", dt, 0.0)
+        fresh = xp.diag(size**2 * -xp.expm1(-2 * step * rate))
+        return LinearPlant(xp.diag(xp.exp(-step * rate)), fresh, center, start, states=names)
+    if dt not in plant.inputs:
+        raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
+
+    def fresh_in(u: jax.Array) -> jax.Array:
+        return jnp.diag(jnp.asarray(size) ** 2 * -jnp.expm1(-2 * u[0] * rate))
+
+    return LinearPlant(lambda u: jnp.diag(jnp.exp(-u[0] * rate)), fresh_in, center, start, states=names, inputs=[dt])
+
+
+def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
+    """The plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
+    n, parts = len(plant.states), (plant, bias)
+    if set(bias.inputs) - set(plant.inputs):
+        raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
+    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
+    states = (*plant.states, *renamed.values())
+    circular = (*plant.circular, *(renamed[name] for name in bias.circular))
+    # Both laws of the initial state, as noise laws.
+    laws = [part.deviation or Gaussian(part.initial_covariance) for part in parts]
+    centers = [part.initial_mean - law.mean for part, law in zip(parts, laws, strict=True)]
+    center = library(*centers).concatenate(centers)
+    noises = [part.noise for part in parts if isinstance(part.noise, AbstractNoise)]
+    constant = len(noises) == 2 and not any(isinstance(m, OfInputs) for part in parts for m in vars(part).values())
+    pick = np.eye(len(plant.inputs))[[plant.inputs.index(name) for name in bias.inputs]]  # its inputs among all
+    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; B_b] u + [w; xi].
+    if isinstance(plant, LinearPlant) and constant:
+        xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
+        matrix = xp.block([[plant.matrix, coupling], [np.zeros((len(bias.states), n)), bias.matrix]])
+        driven = xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
+        return LinearPlant(
+            matrix, Independent(noises), center, Independent(laws), driven, states, plant.inputs, circular
+        )
+    # As functions; Gaussian laws are their covariances.
+    covariance = _diagonal([part.initial_covariance for part in parts])
+    start = covariance if all(part.deviation is None for part in parts) else Independent(laws)
+    return _by_functions(plant, bias, (coupling, pick), (center, start), (states, circular))
+
+
+def _by_functions(
+    plant: AbstractPlant,
+    bias: LinearPlant,
+    matrices: tuple[np.ndarray, np.ndarray],
+    start: tuple[Any, Any],
+    names: tuple[tuple[str, ...], tuple[str, ...]],
+) -> LinearPlant | Plant:
+    """The plant of [x; b] where x is not linear or something depends on inputs; a noise that does has mean zero."""
+    n, coupling, (states, circular) = len(plant.states), matrices[0], names
+    pick: Any = matrices[1]
+
+    def spread(u: jax.Array) -> jax.Array:
+        parts = plant.noise_covariance(u), bias.noise_covariance(pick @ u)
+        return jnp.asarray(jax.scipy.linalg.block_diag(*parts))
+
+    def move(x: jax.Array, u: jax.Array) -> jax.Array:
+        moved = plant.transition(x[:n], u) + plant.noise_mean() + jnp.asarray(coupling) @ x[n:]
+        return jnp.concatenate([moved, bias.transition(x[n:], pick @ u) + bias.noise_mean()])
+
+    # A linear plant stays one, unless its noise has a mean that a covariance by function cannot hold.
+    means = [part.noise.mean for part in (plant, bias) if isinstance(part.noise, AbstractNoise)]
+    if not isinstance(plant, LinearPlant) or not all(is_zero(mean) for mean in means):
+        return Plant(move, spread, *start, states, plant.inputs, circular)
+
+    def matrix(u: jax.Array) -> jax.Array:
+        below = [jnp.zeros((len(bias.states), n)), bias.transition_matrix(pick @ u)]
+        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], below])
+
+    def driven(u: jax.Array) -> jax.Array:
+        return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
+
+    return LinearPlant(matrix, spread, *start, driven, states, plant.inputs, circular)
+
+
+def _diagonal(blocks: list[Any]) -> Any:
+    return scipy_for(blocks).linalg.block_diag(*blocks)
+
+
+def _biased(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
+    """The sensor of [x; b]."""
+    if isinstance(sensor, LinearSensor):
+        stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
+        return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
+
+    def measure(x: jax.Array) -> jax.Array:
+        return sensor.measure(x[:states]) + jnp.asarray(loading) @ x[states:]
+
+    return Sensor(measure, sensor.noise, sensor.outputs, sensor.circular)
+
+
+def _of_each(name: str, value: ArrayLike, count: int) -> list[Any]:
+    """Values of the biases, from one or from as many."""
+    given: Any = value
+    values = list(given) if rank(name, value) else [given] * count
+    if len(values) != count:
+        raise fail(name, f"one, or one for each of {count}", len(values))
+    return values
+
+
+def _rate(time: Any) -> Any:
+    """1 / T, 0 of an infinite one."""
+    constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
+    return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)
