@@ -104,10 +104,9 @@ def segment_of(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Ar
 def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
     """Midpoint of a segment; exactly zero for the middle one of an odd number.
 
-    The amplitude's power of two is factored out, which changes no bit, or its product with many levels would overflow.
+    The quotient comes first: the product with many levels could overflow.
     """
-    fraction, power = jnp.frexp(jnp.asarray(amplitude))
-    return jnp.ldexp((2 * segment + 1 - levels) * fraction / levels, power)
+    return jnp.asarray((2 * segment + 1 - levels) / levels * amplitude)
 
 
 def levels_of(value: int) -> Float[np.ndarray, ""]:

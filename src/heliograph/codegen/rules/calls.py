@@ -34,6 +34,19 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
     return lowering.inline(equation.params["call"], inputs)
 
 
+def _expanded(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
+    item = equation.params["_prim"]
+
+    def function(*leaves: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(item.expand(*jax.tree.unflatten(item.in_tree, leaves)))
+
+    avals: list[Any] = [v.aval for v in equation.invars]
+    struct: Any = jax.ShapeDtypeStruct
+    program = jax.make_jaxpr(function)(*(struct(a.shape, a.dtype) for a in avals))
+    return lowering.inline(program, inputs)
+
+
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline a kernel over runs, traced for one run; several runs in one, such as modes, one after another."""
     avals: list[Any] = [v.aval for v in equation.outvars]
@@ -107,7 +120,7 @@ def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value])
 
 
 IN_MEMORY |= dict.fromkeys(CALLS, _call)
-IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "runs_last": _runs_last}
+IN_MEMORY |= {"custom_vmap_call": _custom_vmap_call, "call_hi_primitive": _expanded, "runs_last": _runs_last}
 RULES |= {"platform_index": _platform_index}
 
 
