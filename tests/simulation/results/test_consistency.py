@@ -20,6 +20,13 @@ def test_nees_is_the_quadratic_form(n, seed):
     np.testing.assert_allclose(hg.nees(truth[0], mean[0], covariance[0]), expected[0], rtol=1e-9)
 
 
+def test_one_covariance_is_that_of_all_steps():
+    e, p = np.array([[1.0, 2.0], [np.nan, 0.5], [3.0, -1.0]]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    repeated = np.tile(p, (3, 1, 1))
+    np.testing.assert_array_equal(hg.nees(e, np.zeros_like(e), p), hg.nees(e, np.zeros_like(e), repeated))
+    np.testing.assert_array_equal(hg.nis(e, p), hg.nis(e, repeated))
+
+
 def test_missing_components_are_left_out():
     s = np.array([[2.0, 1.0], [1.0, 3.0]])
     e = np.array([[1.0, np.nan], [np.nan, 2.0], [np.nan, np.nan]])

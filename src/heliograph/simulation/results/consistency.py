@@ -58,7 +58,7 @@ def nees(
     Args:
         truth: true states, NaN where a component is not known: the others are judged, by their part of P.
         mean: estimates, NaN where there is none.
-        covariance: what is claimed of their errors.
+        covariance: what is claimed of their errors, one (n, n) for all steps or one a step.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite.
@@ -68,7 +68,7 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _squared(x - m, array("covariance", covariance, (*x.shape, x.shape[-1]), missing=True), x)
+    return _squared(x - m, _of_each(covariance, x), x)
 
 
 def nis(
@@ -81,7 +81,7 @@ def nis(
 
     Args:
         innovation: z - E[z | earlier z], NaN for what did not arrive: `filter.run(z).innovations`.
-        covariance: its covariance: `filter.run(z).innovation_covariances`.
+        covariance: its covariance, one (m, m) or one a step: `filter.run(z).innovation_covariances`.
 
     Raises:
         ValueError: shapes that do not fit, infinite numbers.
@@ -90,7 +90,14 @@ def nis(
     """
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
-    return _squared(e, array("covariance", covariance, (*e.shape, e.shape[-1]), missing=True), np.zeros_like(e))
+    return _squared(e, _of_each(covariance, e), np.zeros_like(e))
+
+
+def _of_each(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
+    """Covariance of each step; one matrix is that of all steps."""
+    n = x.shape[-1]
+    shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
+    return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
 
 
 def _squared(
