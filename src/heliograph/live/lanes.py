@@ -63,7 +63,10 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
                 for what, item, two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
                     gap = float(np.abs(item - two).max())
                     if not gap <= TOLERANCE * max(1.0, float(np.abs(item).max())):
-                        return f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}"
+                        return (
+                            f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}; give the "
+                            "plant a function, and a noise, of dt that agree over the parts of an interval"
+                        )
     return ""
 
 

@@ -279,6 +279,17 @@ def test_losses_above_the_square_of_a_mode_are_refused(neighbours, arrivals, ref
         assert made().claims()["b"]["m"] == "upper"
 
 
+@pytest.mark.parametrize(("stays", "refused"), [(0.7, True), (0.69, False)])
+def test_bursts_that_outlast_a_mode_are_refused(stays, refused):
+    link = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.0), 0.01, 1 - stays)
+    plant = hg.LinearPlant([[1.2]], [[0.1]], [0.0], [[1.0]])
+    if refused:
+        with pytest.raises(ValueError, match=r"losses below 0\.694 .* node 'b' learns of a mode of 1.2, got 0.7"):
+            network({"m": RULES["trace"]}, {"b": ["a"]}, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
+    else:
+        assert network({"m": RULES["trace"]}, {"b": ["a"]}, link, plant=plant, rows={"a": ([[1.0]], 0.3)}).meshes
+
+
 def test_a_decaying_mode_that_nobody_observes_stays_with_a_warning():
     plant = hg.LinearPlant(np.diag([1.02, 0.5]), 0.1 * np.eye(2), np.zeros(2), np.eye(2))
     rows = {"a": ([[1.0, 0.0]], 0.3), "b": ([[1.0, 0.0]], 0.3)}

@@ -175,6 +175,25 @@ def arrival_chance(channel: Channel | None) -> float | None:
     return chance if steady else None
 
 
+def loss_rate(channel: Channel | None) -> float | None:
+    """Factor by which one more loss in a row is less probable, in the long run; None where steps or edges are linked.
+
+    Of modes with losses l and transitions P the spectral radius of diag(l) P; without modes the probability of a loss.
+    """
+    arrival = 1.0
+    while isinstance(channel, Erasure | Delayed):
+        arrival *= float(channel.arrival) if isinstance(channel, Erasure) else 1.0
+        channel = channel.base if isinstance(channel, Erasure) else channel.link
+    if not isinstance(channel, Modes):
+        chance = arrival_chance(channel)
+        return None if chance is None else 1 - arrival * chance
+    chances = [arrival_chance(item) for item in channel.maps]
+    if channel.memory.name is not None or None in chances:
+        return None
+    losses = 1 - arrival * np.array(chances, dtype=float)
+    return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(channel.memory.transition))).max())
+
+
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
     """Test whether a channel delivers what is sent."""
     if channel.inputs != channel.outputs:

@@ -20,7 +20,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import arrival_chance, edges_of
+from heliograph.simulation.centres.edges import edges_of, loss_rate
 from heliograph.simulation.node import Node
 
 if TYPE_CHECKING:
@@ -166,18 +166,17 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
 def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
     """Refuse a node whose error grows whatever the rule, since messages from those that see a mode are lost too often.
 
-    Of nodes that do not see the mode lambda, none may get a message with a probability p of |lambda|^2 p >= 1: p is the
-    product of the loss probabilities of all edges into them, over sets of nodes the largest, by a minimal cut.
+    Of nodes that do not see the mode lambda, |lambda|^2 p < 1: p is the product of the loss rates of all edges into
+    them (of losses in bursts the chance of a bad state to stay), over sets of nodes the largest, by a minimal cut.
     """
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
         return
-    chances = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
-               for j, i in graph.edges]  # fmt: skip
-    if any(chance is None for chance in chances):
+    rates = [loss_rate(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link) for j, i in graph.edges]
+    if any(rate is None for rate in rates):
         return
     # Capacities -log p in whole units; those that are never cut get more than all others together.
-    exact = np.array([-np.log(max(1 - float(c or 0.0), 1e-300)) for c in chances])
+    exact = np.array([-np.log(max(float(rate or 0.0), 1e-300)) for rate in rates])
     units = np.minimum(np.round(UNIT * exact), 1e8).astype(np.int32)
     # Of each unstable mode the least cut between the nodes that observe it and each other node.
     values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
