@@ -5,7 +5,6 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from heliograph.numerics.check import array, fail, items, scalar, shown, table
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
@@ -127,6 +126,8 @@ def neighbours_within(
     if len({len(row) for row in rows}) > 1:
         raise fail("positions", "as many numbers for each node", sorted({len(row) for row in rows}))
     names = list(given)
+    from scipy.spatial import cKDTree  # 40 ms, for those who give positions
+
     near = cKDTree(np.array(rows)).query_ball_point(np.array(rows), reach)
     return {
         name: tuple(names[j] for j in sorted(mine) if j != i)
