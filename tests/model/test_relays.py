@@ -5,7 +5,7 @@ from heliograph.linear.system import load_schedule
 from heliograph.model.channel import hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant, Plant
-from heliograph.model.relays import RelayNetwork, link_moments
+from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.law import bernoulli
 from heliograph.relays.design import given_design, local_error_design, relay_schedules
@@ -54,7 +54,7 @@ def test_names_plants_and_horizons_are_checked():
     with pytest.raises(ValueError, match="horizon: expected at most 3 steps"):
         network(slots, plant=over_time([PLANT] * 3)).steps(4)
     with pytest.raises(ValueError, match="known probabilities"):
-        link_moments(hop(bernoulli(0.5, 0.1), 0.1))
+        network([{"receiver": {"sensor": hop(bernoulli(0.5, 0.1), 0.1)}}], relays=()).steps(1)
 
 
 @pytest.mark.parametrize("wrong", [{"relay_1": (4, 3, 2)}, {"receiver": (5, 3, 1)}])

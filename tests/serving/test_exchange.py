@@ -92,6 +92,21 @@ def test_services_that_exchange_messages_tell_what_one_run_tells(loss: float):
             np.testing.assert_allclose(item["covariance"], expected.covariance[k], atol=1e-12)
 
 
+def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun():
+    nodes = {name: Service(item, InMemoryStore()) for name, item in services().items()}
+    sent = []
+    for k in range(4):
+        waiting = [("a", json.dumps({"node": "a", "sequence": k, "time": k, "values": [0.1 * k]}).encode())]
+        while waiting:
+            to, body = waiting.pop(0)
+            outputs = nodes[to].take([body])
+            assert "refused" not in {output.kind for output in outputs}
+            messages = [output for output in outputs if output.kind == "message"]
+            sent += [(k, json.loads(output.body)) for output in messages if to == "c"]
+            waiting += [(output.to, output.body) for output in messages]
+    assert [(k, item["time"], item["values"][-1]) for k, item in sent] == [(k, k - 1, None) for k in (1, 2, 3)]
+
+
 @pytest.mark.parametrize(
     ("rule", "options", "message"),
     [

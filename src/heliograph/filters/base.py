@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, NoReturn, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, NoReturn, ParamSpec, Protocol, TypedDict, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -184,6 +184,32 @@ class AbstractSizedFilter(AbstractFilter):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
+
+
+class Sizes(TypedDict):
+    """Claim and sizes of a filter, as its class takes them."""
+
+    claim: Claim
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    received: int
+
+
+class HasStates(Protocol):
+    """A plant, a filter or a network, with the names of its states and inputs."""
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+
+
+def sized(claim: Claim, like: HasStates, received: int) -> Sizes:
+    """Claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
+    return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 
 @compiled

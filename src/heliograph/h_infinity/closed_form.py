@@ -1,9 +1,9 @@
 """H-infinity design that needs no solver, behind a channel whose gains are known."""
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from heliograph.h_infinity.design import HInfinityDesign
+from heliograph.h_infinity.step import StepMatrices, step_matrices
 from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
@@ -57,8 +57,8 @@ def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, 
     weights[0] = np.diag(np.repeat([state, start], n))
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
     # step by step: K and P2 in closed form, P1 small enough that it does no harm
-    for k in range(steps):
-        result = _best_gain(system, k, weights[k, n:, n:], inner, multipliers[k])
+    for k, step in enumerate(step_matrices(system, separate=True)):
+        result = _best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
         if result is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
@@ -70,28 +70,22 @@ def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, 
 
 
 def _best_gain(
-    system: GrowthSystem, k: int, weight: Float[np.ndarray, "n n"], level: float, multipliers: Float[np.ndarray, "2"]
+    system: GrowthSystem,
+    step: StepMatrices,
+    weight: Float[np.ndarray, "n n"],
+    level: float,
+    multipliers: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
     """K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
-    A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
-    link, n, y = system.channel[k], system.states, system.output.shape[1]
-    bounds = system.growth.error[k], system.output_growth.error[k]
-    # Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I
-    reduced = weight - M.T @ M - sum(c * b**2 for c, b in zip(multipliers, bounds, strict=True)) * np.eye(n)
-    if np.linalg.eigvalsh(reduced)[0] <= 0:
+    errors = slice(system.states, 2 * system.states)
+    grows = [not growth.absent for growth in (system.growth, system.output_growth)]
+    # S^-1 over (e, f~, h~, v, rho): Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I of e, then the multipliers
+    form = level**2 * step.energy - step.target - np.diag(multipliers[grows] @ step.growth[1::2])
+    form[errors, errors] += weight
+    if np.linalg.eigvalsh(form[errors, errors])[0] <= 0:
         return None
-    # e+ = E eta - K U eta: blocks of E, of U and of S over (e, f~, h~, v, rho)
-    gain, noise = link.mean[:, :y], link.mean[:, y:]
-    v, r = B.shape[1], noise.shape[1]
-    parts = [(A, gain @ C, np.linalg.inv(reduced))]
-    if not system.growth.absent:
-        parts.append((np.eye(n), np.zeros((len(gain), n)), np.eye(n) / multipliers[0]))
-    if not system.output_growth.absent:
-        parts.append((np.zeros((n, y)), gain, np.eye(y) / multipliers[1]))
-    parts.append((B, gain @ D, np.eye(v) / level**2))
-    parts.append((np.zeros((n, r)), noise, np.eye(r) / level**2))
-    forward, received = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
-    inverse = block_diag(*(part[2] for part in parts))
+    used = np.flatnonzero(np.diag(form))
+    inverse, forward, received = np.linalg.inv(form[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
     # K* = E S U' (U S U')^-1, P2+^-1 = E S E' - K* U S E'
     cross, spread = received @ inverse @ forward.T, received @ inverse @ received.T
     best = np.linalg.lstsq(spread, cross, rcond=None)[0].T

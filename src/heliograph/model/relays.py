@@ -13,7 +13,7 @@ from heliograph.numerics.check import check_horizon, fail, items, names, table
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_order
 
 SENSOR, RECEIVER = "sensor", "receiver"
 
@@ -167,21 +167,6 @@ class Steps(Module):
         return np.repeat(np.arange(len(self.received)), self.received)
 
 
-def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link."""
-    try:
-        known = link.corner_count() == 1
-    except ValueError:  # too many corners to list
-        known = False
-    if not known:
-        raise fail("link", "known probabilities", "uncertain ones")
-    moments = link.moments(2)
-    mean = np.asarray(moments.mean[:-1])
-    product = np.einsum("ia,jb->ijab", mean, mean)
-    raw = np.asarray(second_moment_tensor(moments.matrix, moments.outputs, moments.inputs))
-    return mean[:, :-1], mean[:, -1], raw - (product + product.swapaxes(2, 3)) / 2
-
-
 def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
     """Return gain, offset, spread, live rows and active senders of one slot, with the shapes of `Steps`."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
@@ -191,14 +176,16 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     spread, talks = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
-            link_gain, link_offset, link_spread = link_moments(at(link, k))
+            moments = second_order(at(link, k))
+            if moments.uncertain:
+                raise fail("link", "known probabilities", "uncertain ones")
             # A listener receives the sum of its links: gains, offsets and spreads of independent links add.
-            received = starts[listener] + np.arange(len(link_offset))
+            received = starts[listener] + np.arange(len(moments.offset))
             sent = m * senders.index(sender) + np.arange(m)
-            gain[np.ix_(received, sent)] = link_gain
-            offset[received] += link_offset
+            gain[np.ix_(received, sent)] = moments.mean_gain
+            offset[received] += moments.offset
             with_one = np.append(sent, columns)
-            spread[np.ix_(received, received, with_one, with_one)] += link_spread
+            spread[np.ix_(received, received, with_one, with_one)] += moments.nominal.center
             live[received], talks[senders.index(sender)] = 1.0, 1.0
     return gain, offset, spread, live, talks
 

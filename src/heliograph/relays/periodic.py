@@ -30,7 +30,6 @@ from heliograph.relays.second_moments import Propagated, gain_mask, propagate
 CONVERGED = 1e-13  # relative change of the moments over a period
 PERIODS = 100_000
 HELD = 1e-9  # the same for a covariance that only gives gains: their error enters it squared
-TINY = float(np.finfo(np.float64).tiny)
 INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
 
 SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
@@ -94,7 +93,7 @@ def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn 
     """Steps of one period, checked for gains under which the second moments converge."""
     check_slots(network, gains)
     steps = periodic_steps(network)
-    radius = float(_growth(steps, gains))
+    radius = spectral_radius(np.asarray(_period(steps, gains)))
     if not radius < 1:
         raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
     return steps
@@ -184,19 +183,10 @@ _steady_behind = compiled(steady_behind)
 
 
 @compiled
-def _growth(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, ""]:
-    """Spectral radius of the linear part of one period of the second moments, by repeated squaring."""
+def _period(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
+    """Linear part of one period of the second moments."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    linear, _, _ = _entries(lambda m: propagate(steps, m, gains).moments[-1], d)
-
-    def double(_: Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        power, log_scale = carry
-        size = jnp.maximum(jnp.linalg.norm(power), TINY)
-        return (power / size) @ (power / size), 2 * (log_scale + jnp.log(size))
-
-    doublings = 30
-    power, log_scale = jax.lax.fori_loop(0, doublings, double, (linear, jnp.zeros(())))
-    return jnp.exp((log_scale + jnp.log(jnp.linalg.norm(power))) / 2.0**doublings)
+    return _entries(lambda m: propagate(steps, m, gains).moments[-1], d)[0]
 
 
 @compiled

@@ -213,7 +213,7 @@ class Watch:
         self.committed.observe(last.committed)
         self.lag.observe(last.lag)
         for output in outputs:
-            if output.kind != "refused":
+            if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
                 self._keep(output.plant, message)
                 if output.kind == "final":

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
@@ -319,10 +319,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         ages=uplinks.delay.shape[1],
         widest=max(uplinks.received),
         quantized=uplinks.quantizers is not None,
-        claim=network.claims()[FUSED][name],
-        states=network.states,
-        inputs=network.inputs,
-        received=len(uplinks.rows),
+        **sized(network.claims()[FUSED][name], network, len(uplinks.rows)),
     )
 
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.over_time import at
-from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_moments
+from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.relays.design import GainsByFilter
 from heliograph_studies.successive_relays.raw_moments import Recomputed, recompute
 
@@ -143,7 +144,8 @@ def _link_constants(
             if not published or (SENSOR in senders) != (listener != RECEIVER):
                 return nothing
             for link in links.values():
-                gain, offset, spread = link_moments(at(link, k))
+                moments = second_order(at(link, k))
+                gain, offset, spread = moments.mean_gain, moments.offset, moments.nominal.center
                 m = len(offset)
                 mean, variance = gain[0, 0], spread[0, 0, 0, 0]
                 shape = np.einsum("ia,jb->ijab", np.eye(m), np.eye(m))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
@@ -74,10 +74,7 @@ def event_filter(
             initial=initial,
             transform=rule,
             loses=loses,
-            claim="exact" if sure and not hidden else "nominal",
-            states=start.states,
-            inputs=start.inputs,
-            received=received,
+            **sized("exact" if sure and not hidden else "nominal", start, received),
             outputs=outputs,
         )
     # A threshold: which losses and regions the sum holds.
@@ -99,10 +96,7 @@ def event_filter(
         loses=loses,
         delivers=all(_delivers(step) for step in steps),
         alike=all(_alike(step) for step in steps),
-        claim="nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=received,
+        **sized("nominal", start, received),
         outputs=outputs,
     )
 

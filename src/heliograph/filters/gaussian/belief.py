@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Transformed, linear_transform
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -135,8 +135,5 @@ def open_loop_filter(
         transform=Cubature(),
         initial_mean=mean,
         initial_covariance=spread,
-        claim=claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=0,
+        **sized(claim, start, 0),
     )

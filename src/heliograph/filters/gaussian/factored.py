@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.factors import (
     Columns,
     Factors,
@@ -271,8 +271,5 @@ def factored(base: AbstractFilter) -> AbstractFilter:
         from_prior=by_prior and random_gain,
         random_gain=random_gain,
         angles=() if isinstance(base, LinearFilter) else base.observed_angles,
-        claim=base.claim,
-        states=base.states,
-        inputs=base.inputs,
-        received=base.received,
+        **sized(base.claim, base, base.received),
     )

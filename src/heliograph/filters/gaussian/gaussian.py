@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects
+from heliograph.filters.base import AbstractFilter, Step, corrects, sized
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
@@ -167,10 +167,7 @@ def _build(
         initial_covariance=spread,
         linear=linear,
         observed_angles=angles,
-        claim=claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized(claim, start, first(channel).outputs),
     )
 
 

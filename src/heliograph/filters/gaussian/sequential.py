@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -99,8 +99,5 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     weakest_part = weakest([item.claim for item in parts])
     return SequentialFilter(
         filters=parts,
-        claim="exact" if weakest_part == "exact" else "nominal",
-        states=parts[0].states,
-        inputs=parts[0].inputs,
-        received=sum(item.received for item in parts),
+        **sized("exact" if weakest_part == "exact" else "nominal", parts[0], sum(item.received for item in parts)),
     )

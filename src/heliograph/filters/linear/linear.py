@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import corrected, describe
@@ -224,10 +224,9 @@ def linear_filter(
         channel=described,
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
-        claim="upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized(
+            "upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact", start, first(channel).outputs
+        ),
     )
 
 

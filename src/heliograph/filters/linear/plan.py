@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
@@ -144,10 +144,7 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
         covariances=known,
         start=start.mean,
         projection=projection,
-        claim=filter.claim,
-        states=filter.states,
-        inputs=filter.inputs,
-        received=filter.received,
+        **sized(filter.claim, filter, filter.received),
     )
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -312,10 +312,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         components=components,
         initial=modes[0].initial,
         observed_angles=angles,
-        claim="nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized("nominal", start, first(channel).outputs),
     )
 
 

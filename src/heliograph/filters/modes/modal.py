@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
 from heliograph.filters.innovation import gaussian_innovation
@@ -304,10 +304,7 @@ def built_of_modes(kind: type[M], plant: AnyPlant, sensor: AnySensor, channel: C
         sensor=sensor,
         channel=described,
         initial=initial,
-        claim=claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized(claim, start, first(channel).outputs),
     )
 
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.linear import LinearBelief, corrected_linear, moved, within_range
@@ -204,8 +204,9 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
         sensor=sensor,
         channel=channel,
         late=late,
-        claim="nominal" if late and uncertain_chain(channel) else claim_of_modes(channel),
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs + len(memories(channel)),
+        **sized(
+            "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel),
+            start,
+            first(channel).outputs + len(memories(channel)),
+        ),
     )

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import corrected, signal_of
@@ -268,10 +268,7 @@ def _build(
         merging=merging,
         transform=Cubature() if transform is None else transform,
         observed_angles=angles,
-        claim="nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized("nominal", start, first(channel).outputs),
     )
 
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -165,8 +165,5 @@ def particle_filter(
         observed_angles=angles,
         particles=check_count("particles", particles),
         seed=check_count("seed", seed, 0),
-        claim="nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs,
+        **sized("nominal", start, first(channel).outputs),
     )

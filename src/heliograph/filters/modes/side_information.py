@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.modal import (
@@ -298,10 +298,7 @@ def side_information_filter(
         channel=over_time(described) if isinstance(channel, OverTime) else described[0],
         initial=steps[0].initial,
         flagged=flags is not None,
-        claim="exact" if known else "nominal",
-        states=start.states,
-        inputs=start.inputs,
-        received=first(channel).outputs + (flags is not None),
+        **sized("exact" if known else "nominal", start, first(channel).outputs + (flags is not None)),
     )
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
@@ -202,8 +202,5 @@ def clock_filter(
     return ClockFilter(
         base=base,
         offsets=tuple(states.index(name) for name in names),
-        claim="nominal",
-        states=base.states,
-        inputs=base.inputs,
-        received=base.received,
+        **sized("nominal", base, base.received),
     )

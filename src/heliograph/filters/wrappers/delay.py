@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
@@ -191,10 +191,7 @@ def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, line
         base=base,
         links=links,
         lines=lines,
-        claim=base.claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=channel.outputs,
+        **sized(base.claim, start, channel.outputs),
     )
 
 
@@ -338,10 +335,7 @@ def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(item) for item in items]),
-        claim=base.claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=channel.outputs,
+        **sized(base.claim, start, channel.outputs),
     )
 
 

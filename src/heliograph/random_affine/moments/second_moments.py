@@ -212,7 +212,8 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     check_forgets("channel of a filter", channel)
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
-    known = _is_known(channel)
+    corners = _corner_count(channel)
+    known = corners == 1
     # Known law: the moments themselves.
     if known:
         spread, shift, power = _tensors(nominal, mean)
@@ -220,11 +221,11 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
     elif isinstance(channel, Stack):
         parts = _from_stack(channel)
-    elif _few_corners(channel):
-        corners = (
+    elif corners is not None and corners <= CORNERS:
+        laws = (
             Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
         )
-        stacks = zip(*(_tensors(corner, mean) for corner in corners), strict=True)
+        stacks = zip(*(_tensors(corner, mean) for corner in laws), strict=True)
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
@@ -237,20 +238,6 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     nominal = channel.moments(2)
     spread = _tensors(nominal, nominal.mean[:-1])[0]
     return QuadraticMap(spread, np.zeros(spread.shape))
-
-
-def _few_corners(channel: AbstractRandomAffine) -> bool:
-    try:
-        return channel.corner_count() <= CORNERS
-    except ValueError:  # one law alone has too many corners to list
-        return False
-
-
-def _is_known(channel: AbstractRandomAffine) -> bool:
-    try:
-        return channel.corner_count() == 1
-    except ValueError:
-        return False
 
 
 def second_moment_tensor(matrix: Matrix, outputs: int, inputs: int) -> Tensor:
