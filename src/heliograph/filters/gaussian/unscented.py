@@ -86,8 +86,8 @@ def unscented_filter(
     sensor: AnySensor,
     channel: "Channel|None" = None,
     alpha: float = 1e-3,
-    beta: float = 2.0,
-    kappa: float = 0.0,
+    beta: float = 2,
+    kappa: float = 0,
     update: "AbstractUpdate|None" = None,
     initial_mean: "Float[ArrayLike, ' n'] | None" = None,
     initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
@@ -116,7 +116,7 @@ def unscented_filter(
 
     Source: Wan and van der Merwe, The unscented Kalman filter (2001).
     """
-    transform = Unscented(alpha, beta, kappa)
+    transform = Unscented(1.0 * alpha, 1.0 * beta, 1.0 * kappa)  # whole numbers too
     check_plant(plant)
     transform.check(len(first(plant).states))
     return gaussian_filter(plant, sensor, channel, transform, update, initial_mean, initial_covariance)
