@@ -11,7 +11,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import add, times_vector
+from heliograph.numerics.linalg import PRECISE, add, times_vector
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.traced import is_traced, library
@@ -204,17 +204,24 @@ def _sources(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarra
 
 
 def _check(covariance: Array, apart: bool) -> None:
-    """Raise ValueError where no noise could be weighed, or where components are correlated and may not be."""
+    """Raise ValueError where no noise could be weighed, or where components are correlated and may not be.
+
+    Nor may they be tied: other weights would make another combination of them the one without noise, a wrong one.
+    """
     if is_traced(covariance):
         return
     variance = np.diag(covariance)
     if np.any(variance <= 0):
         expected = "noise of the sensor (or a law with outliers in the last hop) in each received number"
         raise fail("noise of a robust filter", expected, f"variance {variance.min():g}")
-    off = np.abs(covariance - np.diag(variance)) / np.sqrt(np.outer(variance, variance))
+    correlations = covariance / np.sqrt(np.outer(variance, variance))
+    off = np.abs(correlations - np.eye(len(variance)))
     if apart and np.any(off > TOLERANCE):
         expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
         raise fail("noise of a robust filter", expected, f"a correlation of {off.max():.3g}")
+    if (least := np.linalg.eigvalsh(correlations)[0]) < PRECISE:
+        expected = "some in each combination of the received numbers"
+        raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
 def _pairs(sensed: Branches, late: Branches) -> tuple[Array, ...]:

@@ -224,6 +224,10 @@ def test_claims_are_what_is_proved():
     [
         (lambda: robust(law=hg.StudentT([[1.0, 0.5], [0.5, 1.0]], 3.0)), "independent components"),
         (lambda: robust(hg.filters.Huber(), np.zeros((2, 2))), "noise of the sensor"),
+        (
+            lambda: robust(hg.filters.Huber(), np.ones((2, 2))),
+            "some in each combination of the received",
+        ),
         (lambda: robust(hg.filters.StudentVB(), np.eye(2)), "StudentVB: expected noise of Student's law"),
         (lambda: robust("huber"), r"rule: expected one such as Huber\(1.345\)"),
         (lambda: hg.filters.Huber(0.0), "constant of Huber's rule: expected a positive number"),
