@@ -11,6 +11,14 @@ from .comparisons import (
 from .error import (
     Error as Error,
 )
+from .messages import (
+    MessageRate as MessageRate,
+    delta_for_rate as delta_for_rate,
+    least_error as least_error,
+    prediction_error_rate as prediction_error_rate,
+    send_on_delta_rate as send_on_delta_rate,
+    simulated_rate as simulated_rate,
+)
 from .paths.networks import (
     paths_of as paths_of,
 )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies.event_triggered.rates import least_error, simulated_rate
+from heliograph.planning.messages import least_error, simulated_rate
 from heliograph_studies.event_triggered.setting import Setting, rooms
 from heliograph_studies.stages import Stages
 
