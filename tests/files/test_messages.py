@@ -210,7 +210,8 @@ def test_a_fit_learns_the_law_of_delays_from_the_times_of_logging(world, tmp_pat
 def test_dates_become_steps_of_a_network_that_counts_them(tmp_path):
     """Steps of half a second from the first date on: each date is of the nearest; an event is as late as it was."""
     plant, sensor = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
-    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {}, trigger=hg.SendOnDelta(0.5))})
+    filters = {"skips": hg.kalman_filter(plant, sensor)}
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), filters, trigger=hg.SendOnDelta(0.5))})
     rows = [("10:00:00.100", 1.0, "10:00:00.2"), ("10:00:01.050", 2.0, "10:00:03"), ("10:00:02.320", 3.0, "10:00:02.4")]
     text = "".join(f"2026-11-25T{at}Z,{value},2026-11-25T{came}Z\n" for at, value, came in rows)
     (tmp_path / "log.csv").write_text(f"at,value,arrival\n{text}")
