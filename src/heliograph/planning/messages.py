@@ -211,6 +211,7 @@ def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, f
     size = 2 * n + 1
     low, high = np.clip(np.arange(size) - cells, 0, None), np.minimum(np.arange(size) + cells + 1, size)
 
+    # Law of (state, value sent last) after a message: the value is the one measured now.
     def event(f: np.ndarray) -> np.ndarray:
         sums = np.cumsum(np.pad(f, ((0, 0), (1, 0))), axis=1)
         return np.asarray((sums[:, -1:] - sums[:, high] + sums[:, low]) * noise)
@@ -219,6 +220,7 @@ def _rate_on_grid(system: _Scalar, delta: float, share: float) -> tuple[float, f
         f = move @ vector.reshape(size, size)
         return np.asarray(f * quiet + event(f)).ravel()
 
+    # Power iterations (Arnoldi) from the law of the state and a value that was just sent.
     start = _cells(x, np.zeros(1), deviation).T * noise
     operator = LinearOperator((size**2, size**2), matvec=step, dtype=np.float64)
     try:
