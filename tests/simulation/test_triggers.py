@@ -192,7 +192,7 @@ def test_what_does_not_fit_is_refused_in_one_line():
     late = hg.hop(1.0, 0.01, delay=1)
     with pytest.raises(ValueError, match="channel of a node with a trigger: expected one that is not late"):
         hg.Node(SENSOR, late, {}, trigger=hg.SendOnDelta(1.0))
-    with pytest.raises(ValueError, match=r"trigger: expected a AbstractTrigger, got 1\.0"):
+    with pytest.raises(ValueError, match=r"trigger: expected an AbstractTrigger, got 1\.0"):
         hg.Node(SENSOR, LOSSY, {}, trigger=1.0)
     with pytest.raises(ValueError, match="delta of the trigger: expected one number, or 1, got shape"):
         hg.Node(SENSOR, LOSSY, {}, trigger=hg.SendOnDelta([1.0, 2.0]))

@@ -1,5 +1,6 @@
 """Filters behind senders that decide: against the exact posterior, in their limits, and what they refuse."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -181,3 +182,21 @@ def test_what_does_not_fit_is_refused_in_one_line():
         with pytest.raises(ValueError, match=words) as error:
             build()
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("reference", ["zero", "prediction"])
+@pytest.mark.parametrize("link", [hg.perfect(), hg.hop(0.7, noise=0.05)], ids=["perfect", "hop"])
+def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, reference):
+    """p(z, sent) and P(nothing) sum to 1, and e has mean 0 and the claimed variance: to the floor of 1e-6."""
+    plant = hg.LinearPlant([[0.95]], 0.1, [0.8], 1.0)
+    item = hg.event_filter(plant, SENSOR, link, hg.StochasticTrigger(2.0, reference))
+    state = item.predict(item.init())
+    z = np.linspace(-12.0, 12.0, 4001)
+    innovation = jax.vmap(lambda value: item.correct(state, value[None])[1])(z)
+    density = np.exp(np.asarray(innovation.log_likelihood, dtype=float))
+    nothing = np.exp(float(item.correct(state, [np.nan])[1].log_likelihood))
+    sent = np.trapezoid(density, z)
+    assert sent + nothing == pytest.approx(1, abs=2e-6)
+    e, variance = np.asarray(innovation.value)[:, 0], np.asarray(innovation.covariance)[:, 0, 0]
+    assert np.trapezoid(density * e, z) / sent == pytest.approx(0, abs=1e-5)
+    assert np.trapezoid(density * e**2 / variance, z) / sent == pytest.approx(1, abs=1e-5)

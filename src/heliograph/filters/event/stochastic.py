@@ -116,28 +116,89 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         there = jnp.any(~jnp.isnan(values))
         log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
-        total = jnp.where(there, innovation.log_likelihood, log_nothing)
-        after = jax.tree.map(lambda a, b: jnp.where(there, a, b), came, nothing)
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        log_came = innovation.log_likelihood
+        if isinstance(self.trigger, StochasticTrigger):
+            # Given that it was sent, where no component of it is missing.
+            link, whole = self._link(channel, state.law), ~jnp.any(jnp.isnan(value))
+            shift, change = self._given_sent(link, signal, state.reference, log_silent)
+            complete = jnp.where(whole, value, 0.0), jnp.where(whole, covariance, jnp.eye(len(value)))
+            log_sent = self._log_sent(link[0], signal, state.reference, *complete)
+            log_came = log_came + jnp.where(whole, log_sent, 0.0)
+            value, covariance = (
+                jnp.where(whole, value - shift, value),
+                jnp.where(whole, covariance + change, covariance),
+            )
+        total = jnp.where(there, log_came, log_nothing)
+        after = jax.tree.map(lambda a, b: jnp.where(there, a, b), came, nothing)
         if len(down):
             known, covariance = with_flag(covariance, down[0])
             value = jnp.append(value, known)
         following = state._replace(mean=after.mean[0], covariance=after.covariance[0], law=after.label[0, 0])
         return following, Innovation(value, covariance, total)
 
+    def _link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link where all of what was sent arrives."""
+        whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
+        gain, spread = (
+            jnp.tensordot(whole, jnp.asarray(part), 2) / jnp.sum(whole) for part in (channel.mean, channel.spread)
+        )
+        return gain[:, :-1], spread
+
+    def _given_sent(
+        self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """What it adds to the mean and covariance of a value that it was sent: larger ones are sent more often.
+
+        Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
+        m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
+        """
+        (gain, spread), mean, total = link, signal.mean, signal.covariance
+        # Of y.
+        silent = jnp.minimum(jnp.exp(log_silent), 1 - FLOOR)
+        solved = psd_solve(total + self._inverse_weight(), total)
+        d = (reference - mean) @ solved
+        shift = -silent * d / (1 - silent)
+        about = (total - silent * (total - total @ solved + jnp.outer(d, d))) / (1 - silent) - total
+        # Of z: the mean gain, and the spread, which acts on second moments of (y, 1).
+        second = about + jnp.outer(mean, shift) + jnp.outer(shift, mean)
+        second = jnp.block([[second, shift[:, None]], [shift, jnp.zeros(1)]])
+        change = gain @ (about - jnp.outer(shift, shift)) @ gain.T + jnp.einsum("ijkl,kl->ij", spread, second)
+        return gain @ shift, symmetrize(change)
+
+    def _log_sent(
+        self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
+    ) -> jax.Array:
+        """log P(sent | z) = log(1 - P(silent | z)), by the law of y given z with this innovation."""
+        total, inverse = signal.covariance, self._inverse_weight()
+        back = psd_solve(covariance, gain @ total)
+        left = symmetrize(total - total @ gain.T @ back) + inverse
+        off = reference - signal.mean - value @ back
+        log_silent = log_density(off, left, jnp.abs(reference)) + self._log_height()
+        return jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_silent, 0.0)), FLOOR))
+
+    def _inverse_weight(self) -> jax.Array:
+        """W^-1, the noise with which silence is a measurement."""
+        assert isinstance(self.trigger, StochasticTrigger)
+        return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
+
+    def _log_height(self) -> jax.Array:
+        """log of exp(-e' W e / 2) over the density N(e; 0, W^-1)."""
+        assert isinstance(self.trigger, StochasticTrigger)
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
+        return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
+
     def _silence(self, prior: Belief, signal: Signal, reference: jax.Array, k: Step) -> tuple[jax.Array, Belief]:
         """log P(silent) where the link is up, and the state given it."""
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior
-        weight = self.trigger.matrix(self.outputs)
-        total = signal.covariance + psd_solve(weight, jnp.eye(self.outputs))
+        total = signal.covariance + self._inverse_weight()
         value = reference - signal.mean
         solved = psd_solve(total, signal.cross.T)
         covariance = symmetrize(prior.covariance - signal.cross @ solved)
-        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(weight))))
         density = log_density(value, total, jnp.abs(reference) + jnp.abs(signal.mean))
-        log_silent = density + (self.outputs * np.log(2 * np.pi) - log_det) / 2
+        log_silent = density + self._log_height()
         return log_silent, Belief(prior.mean + value @ solved, covariance)
 
     @in_float64
@@ -151,4 +212,5 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 
 def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:
-    return Parts(log_weight[None], belief.mean[None], belief.covariance[None], law[None, None])
+    mean, covariance, law = (jnp.asarray(part)[None] for part in (belief.mean, belief.covariance, law))
+    return Parts(log_weight[None], mean, covariance, law[None])

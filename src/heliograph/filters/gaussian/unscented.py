@@ -116,7 +116,7 @@ def unscented_filter(
 
     Source: Wan and van der Merwe, The unscented Kalman filter (2001).
     """
-    transform = Unscented(1.0 * alpha, 1.0 * beta, 1.0 * kappa)  # whole numbers too
+    transform = Unscented(scalar("alpha", alpha), scalar("beta", beta), scalar("kappa", kappa))
     check_plant(plant)
     transform.check(len(first(plant).states))
     return gaussian_filter(plant, sensor, channel, transform, update, initial_mean, initial_covariance)
