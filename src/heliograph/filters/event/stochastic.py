@@ -148,7 +148,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _given_sent(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """What it adds to the mean and covariance of a value that it was sent: larger ones are sent more often.
+        """Change of the mean and covariance of a value by knowing that it was sent: larger ones are sent more often.
 
         Of y ~ N(m, S) the share s is silent, with mean m + d and covariance S_s, so that of what is sent the mean is
         m - s d / (1 - s) and the second moment about m is (S - s (S_s + d d')) / (1 - s).
