@@ -14,7 +14,8 @@ from scipy.stats import chi2
 pytest.importorskip("uvicorn")
 from heliograph.numerics.types import NameWithUnit
 from heliograph.serving.page import Door, Tallies, door, shown
-from heliograph.serving.watch import DOUBT, MEMORY, RunningNis, Watch, watch_of
+from heliograph.serving.running_nis import DOUBT, MEMORY, RunningNis
+from heliograph.serving.watch import Watch, watch_of
 from tests.serving.watched import Scripted
 from tests.serving.worlds import stepping
 from tests.widths import program

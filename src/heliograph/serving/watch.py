@@ -4,12 +4,10 @@ import math
 import threading
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from prometheus_client import CollectorRegistry, Histogram
 from pydantic_core import from_json
-from scipy.special import gammaincinv
 
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
@@ -20,60 +18,8 @@ from heliograph.report.outputs import RecentOutputs, output_row
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.serving.running_nis import MEMORY, RunningNis
 from heliograph.simulation.network import FUSED, Network
-
-MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
-FEWEST = 20  # received components before a test is made
-DOUBT = 0.001  # how often an honest filter is outside its band
-
-
-@dataclass
-class RunningNis:
-    """Exponentially weighted sum of NIS values, e' S^-1 e, of a filter at a node: weights w^age, w = 1 - 1/MEMORY.
-
-    If S is the true covariance each NIS is chi-squared with m degrees of freedom, the number of received components:
-    the weighted sum has mean sum w m and variance sum w^2 2m. Divided by its mean it should be 1; its band is that of a
-    gamma law with these two moments (the chi-squared law itself where all weights are 1).
-    """
-
-    claim: Claim
-    total: float = 0.0
-    mean: float = 0.0
-    variance: float = 0.0
-    numbers: int = 0
-
-    def add(self, squared: float, received: int) -> None:
-        """Add the NIS of one row, with its degrees of freedom."""
-        stored = 1 - 1 / MEMORY
-        self.total = stored * self.total + squared
-        self.mean = stored * self.mean + received
-        self.variance = stored * stored * self.variance + 2 * received
-        self.numbers += received
-
-    @property
-    def ratio(self) -> float:
-        """Return the weighted sum over its expected value: about 1 if the covariance is right."""
-        return self.total / self.mean if self.mean else float("nan")
-
-    def band(self) -> tuple[float, float]:
-        """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right."""
-        if not self.mean:
-            return 0.0, float("inf")
-        shape = self.mean**2 / self.variance
-        low, high = gammaincinv(shape, [DOUBT / 2, 1 - DOUBT / 2]) / shape
-        return float(low), float(high)
-
-    def doubt(self) -> str | None:
-        """Explain why the claim is doubtful, or return None."""
-        low, high = self.band()
-        if self.numbers < FEWEST:
-            return None
-        if self.ratio > high:
-            return f"its squared innovations are {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
-        if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
-            return f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
-        return None
-
 
 T = TypeVar("T")
 PLANTS = 200  # plants with estimates in memory, those with the newest messages
