@@ -45,7 +45,7 @@ def test_every_benchmark_is_in_the_results(bench: ModuleType, results: dict[str,
     for name, item in bench.COMPARISONS.items():
         result = results["comparisons"][name]
         assert set(result) - {"old_release"} == {"title", "unit", "runs", "steps", "floor", "distance", "ours", "peers"}
-        assert set(result["ours"]) == {"best", "median", "how", "runs", "versions"}
+        assert set(result["ours"]) == {"best", "median", "how", "processors", "runs", "versions"}
         assert {title: peer.get("target") for title, peer in result["peers"].items()} == {
             peer.title: peer.target for peer in item.peers
         }
