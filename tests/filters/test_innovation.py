@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.filters.innovation import gaussian_innovation, log_density
+from heliograph.filters.innovation import gaussian_innovation, log_density, posterior_weights
 
 ROUNDING = 1e-12
 
@@ -85,3 +85,17 @@ def test_a_step_computes_an_innovation_only_on_request():
 
     assert " log(" in program(lambda s, z: item.correct(s, z)[1].log_likelihood)
     assert " log(" not in program(item.step)
+
+
+def test_what_all_components_exclude_leaves_their_weights():
+    """And an impossible component stays so, whatever it says; the log-likelihood is -inf."""
+    with jax.enable_x64(True):
+        weights = np.array([0.3, 0.7, 0.0])
+        after, density, excluded = posterior_weights(weights, np.array([-np.inf, -np.inf, np.nan]))
+        assert bool(excluded) and float(density) == -np.inf
+        np.testing.assert_allclose(after, weights, rtol=1e-15)
+        after, density, excluded = posterior_weights(weights, np.array([-2.0, -1.0, 5.0]))
+    assert not bool(excluded)
+    raw = np.array([0.3 * np.exp(-2.0), 0.7 * np.exp(-1.0), 0.0])
+    np.testing.assert_allclose(after, raw / raw.sum(), rtol=1e-15)
+    assert float(density) == pytest.approx(np.log(raw.sum()), rel=1e-15)

@@ -9,12 +9,12 @@ import numpy as np
 from heliograph.filters.gaussian.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.linalg import (
-    NEGATIVE_TOLERANCE,
     OFF_SUPPORT,
     OFF_VALUE,
     PIVOT_TOLERANCE,
     UNROLL_LIMIT,
     congruence,
+    negative_tolerance,
     rounding,
 )
 from heliograph.numerics.module import readable
@@ -78,6 +78,21 @@ def mixed_innovation(
     return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
 
 
+def posterior_weights(
+    weight: "Float[Array, ' parts']", likelihood: "Float[Array, ' parts']"
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Weights p_a N(z; ...) of a mixture's components, the log-likelihood of z, and whether all components exclude z.
+
+    The weights stay as they are where all exclude z, with a likelihood of -inf each.
+    """
+    # log p_a N(z; ...), and -inf of a component that is impossible, whatever it says.
+    possible = jnp.asarray(weight) > 0
+    prior = jnp.where(possible, jnp.log(jnp.where(possible, weight, 1.0)), -jnp.inf)
+    weighed = jnp.where(possible, likelihood, 0.0) + prior
+    excluded = jnp.max(weighed) == -jnp.inf
+    return jax.nn.softmax(jnp.where(excluded, prior, weighed)), jax.nn.logsumexp(weighed), excluded
+
+
 def _shape_of_runs(value: jax.Array, covariance: jax.Array, size: jax.Array) -> tuple[int, ...]:
     return jnp.broadcast_shapes(value.shape[1:], covariance.shape[2:], size.shape[1:])
 
@@ -102,11 +117,11 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
     reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
     def condition(j: int | jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        rest, left, total = carry
+        rest, left, total, growth = carry
         pivot = left[j, j]
         # Determined: the pivot is zero, to rounding.
         determined = (pivot <= rounding(PIVOT_TOLERANCE, value) * variance[j]) & (
-            pivot >= -rounding(NEGATIVE_TOLERANCE, value) * variance[j]
+            pivot >= -negative_tolerance(value, growth) * variance[j]
         )
         safe = jnp.where(determined, 1.0, pivot)
         scale = 1 / safe
@@ -116,9 +131,11 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
         # Condition the remaining components on component j.
         column = jnp.where(determined, 0.0, left[:, j] * scale)
         after = rest - column * rest[j], left - column[:, None] * left[j][None]
-        return *after, total + jnp.where(determined, agrees, density)
+        growth = jnp.maximum(growth, jnp.where(determined, 0.0, variance[j] * scale))
+        return *after, total + jnp.where(determined, agrees, density), growth
 
-    carry: tuple[jax.Array, ...] = (rest, left, jnp.zeros_like(jnp.sum(left, axis=(0, 1))))
+    none = jnp.zeros_like(jnp.sum(left, axis=(0, 1)))
+    carry: tuple[jax.Array, ...] = (rest, left, none, none)
     if m > UNROLL_LIMIT:
         carry = jax.lax.fori_loop(0, m, condition, carry)
         return carry[2]

@@ -75,6 +75,19 @@ def congruence(a: Array, p: jax.Array) -> jax.Array:
     return symmetric(times(times(a, p), transpose(a)))
 
 
+def above_products(product: jax.Array, a: Array, p: jax.Array) -> jax.Array:
+    """A P A' of a covariance with the rounding of its sums, so that it is one however much of them cancels.
+
+    The product is off by some eps |A| |P| |A|', of which n (n + 2) eps sum_j A_ij^2 P_jj on the diagonal takes care.
+    What a step leaves of that is the more beside the variance the more states that are tied cancel, and the next steps
+    may multiply it. Where the product is zero, nothing was rounded.
+    """
+    n, left = a.shape[1], diagonal_of(product)
+    reach = times_vector(a * a, jnp.maximum(diagonal_of(p), 0.0))
+    rounded = n * (n + 2) * float(np.finfo(product.dtype).eps) * reach
+    return product + diagonal(jnp.where(left != 0, rounded, 0.0))
+
+
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
     """tr(A' B)."""
     products = a * b
@@ -155,21 +168,31 @@ def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     """
     columns: list[jax.Array] = []
     scales: list[jax.Array] = []
+    growth: jax.Array | float = 0.0
     for j in range(a.shape[0]):
         rest = minus(a[j:, j], (c[j:] * c[j] for c in columns))
-        scales.append(pivot_scale(rest[0], a[j, j]))
+        scales.append(pivot_scale(rest[0], a[j, j], growth))
+        growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
         columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
     return columns, scales
 
 
-def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
+def pivot_scale(pivot: jax.Array, whole: jax.Array, growth: jax.Array | float) -> jax.Array:
     """1 / root of a pivot; 0 for one that is zero up to rounding of the whole diagonal entry, NaN for a negative one.
 
-    The root is taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
+    `growth`: the largest ratio of a diagonal entry to its pivot before; dividing by such a pivot multiplies by it what
+    rounding makes of this one. The root is taken of a positive number in any case, of infinity where nothing is left:
+    the derivative there is 0.
     """
-    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot, 1000) * whole
+    singular = pivot >= -negative_tolerance(pivot, growth) * whole
     beyond = jnp.where(singular, jnp.inf, jnp.nan)
     return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
+
+
+def negative_tolerance(like: jax.Array, growth: jax.Array | float) -> jax.Array:
+    """How far below zero a pivot is rounding of a singular matrix, beside its diagonal entry."""
+    eps = float(np.finfo(like.dtype).eps)
+    return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
 
 def solve(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -206,12 +229,16 @@ def long_factor(a: jax.Array) -> jax.Array:
     """The lower factor of one larger matrix by the same rule."""
     n, whole = a.shape[-1], jnp.diagonal(a)
 
-    def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        a, done = carry
-        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], whole[j]), 0.0)
-        return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
+    def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        a, done, growth = carry
+        scale = pivot_scale(a[j, j], whole[j], growth)
+        column = jnp.where(jnp.arange(n) >= j, a[:, j] * scale, 0.0)
+        # a: the Schur complement of the pivot.
+        return a - jnp.outer(column, column), done.at[:, j].set(column), jnp.maximum(growth, whole[j] * scale * scale)
 
-    result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
+    result: jax.Array = jax.lax.fori_loop(
+        0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a), jnp.zeros_like(a[0, 0]))
+    )[1]
     return result
 
 

@@ -42,7 +42,8 @@ class Signal(NamedTuple):
 
     Shapes: mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m). For a
     linear sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update avoids cancellation, and
-    the deviation (m,) that rounding alone gives to y (`output_rounding`).
+    the deviation (m,) that rounding alone gives to y: that of v (`noise_rounding`), to which `corrected` adds that of
+    C x (`output_rounding`).
     """
 
     mean: jax.Array
@@ -270,7 +271,7 @@ def _covariance(
     noise: jax.Array,
 ) -> jax.Array:
     return pick(
-        _is_precise(omega, noise),
+        is_precise(omega, noise),
         lambda: sum_of_squares(prior, root(prior), transpose(solved), output, noise),
         lambda: _difference(prior, cross, solved),
     )
@@ -290,7 +291,7 @@ def _by_precision(
     rounded: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     return pick(
-        _is_precise(omega, noise),
+        is_precise(omega, noise),
         lambda: precise_update(prior, output, noise, rounded),
         lambda: (transpose(solved), _difference(prior, cross, solved)),
     )
@@ -299,7 +300,7 @@ def _by_precision(
 _gain_and_covariance = runs_last(partial(_by_precision, where_any), partial(_by_precision, where_each))
 
 
-def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
+def is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
     """Test whether some component's noise, given those before it, is far below its innovation variance.
 
     So a combination of components that is free of noise counts, though no single component is.

@@ -7,7 +7,13 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects, sized
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
-from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
+from heliograph.filters.gaussian.precise import (
+    above_rounding,
+    initial_size,
+    noise_rounding,
+    output_rounding,
+    state_rounding,
+)
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -79,8 +85,14 @@ def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractT
         measured = transform.apply(continued(sensor.measure, state.mean, plant.angles, sensor.angles), *state)
     mean = measured.mean + sensor.noise.mean
     spread = measured.covariance + sensor.noise.covariance
-    known = (sensor.matrix, sensor.noise.covariance) if isinstance(sensor, LinearSensor) else ()
-    return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean), *map(jnp.asarray, known))
+    signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
+    return with_known(signal, sensor) if isinstance(sensor, LinearSensor) else signal
+
+
+def with_known(signal: Signal, sensor: LinearSensor) -> Signal:
+    """Signal of a linear sensor with its matrix, its noise, and the rounding of that."""
+    matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
+    return signal._replace(matrix=matrix, noise=noise, rounding=noise_rounding(mean, noise))
 
 
 def corrected(
@@ -99,8 +111,8 @@ def corrected(
     `unknown`: what of the signal decides gain and covariance, where that is less than all.
     """
     unknown = signal if unknown is None else unknown
-    if unknown.matrix is not None:
-        unknown = unknown._replace(rounding=output_rounding(unknown.matrix, size))
+    if unknown.matrix is not None and unknown.rounding is not None:
+        unknown = unknown._replace(rounding=unknown.rounding + output_rounding(unknown.matrix, size))
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))

@@ -34,14 +34,15 @@ LEFT = 100  # times its rounding: a variance below has lost its digits
 class Component(NamedTuple):
     """One component of T z, whose rows make the noises of the components uncorrelated.
 
-    Shapes: number e_j (m,), row T H of it and its rounding in eps, size (n,), the noise's variance (), least variance
-    that is not rounding (); or of all components, one more axis first. Runs last.
+    Shapes: number e_j (m,), row T H of it and its rounding in eps, size (n,), the variance of noise and rounding () and
+    that of noise alone (), least variance that is not rounding (); or of all components, one axis more. Runs last.
     """
 
     number: jax.Array
     row: jax.Array
     size: jax.Array
     variance: jax.Array
+    noise: jax.Array
     least: jax.Array
 
 
@@ -64,40 +65,50 @@ def precise_update(
     Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
     Filtering for stochastic processes (1968).
     """
-    n, m, noise = len(prior), len(output), noise + diagonal(rounded)
+    n, m = len(prior), len(output)
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
     # Square root of P, and the components of z with uncorrelated noises.
     start = root(prior)
-    turn, components = _components(start, output, noise)
+    turn, components = _components(start, output, noise, rounded)
     nothing = jnp.zeros((n, m, *runs), start.dtype)
     unit = (n + 2) * float(np.finfo(start.dtype).eps)
     mean = jnp.broadcast_to(diagonal(unit * jnp.sqrt(jnp.maximum(diagonal_of(prior), 0.0))), (n, n, *runs))
     begin = _Taken(jnp.broadcast_to(start, (n, n, *runs)), mean, nothing, nothing)
     taken = jax.lax.scan(_use_component, begin, components)[0]
     gain = times(taken.gain, turn)
-    after = sum_of_squares(prior, start, gain, output, noise)
+    after = sum_of_squares(prior, start, gain, output, noise) + times(gain * rounded[None], transpose(gain))
     remaining = jnp.asarray(identity(n, gain)) - times(gain, output)
     return times(taken.whole, turn), after + diagonal(_lost(prior, remaining, after))
 
 
-def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
+def _components(
+    start: jax.Array, output: jax.Array, noise: jax.Array, rounded: jax.Array
+) -> tuple[jax.Array, Component]:
     """T (m, m) and the components of T z, with the rounding that the elimination leaves in each row.
 
-    T H is off by eps |T| (|H| + W |T H|), W_ji = root(N_jj N_ii) / D_i for i < j: what an error of eps in the products
-    of N = L D L' changes in L_ji. Noises that are tied leave small D_i, as does the power of a random gain and a mean
-    far from zero.
+    T H is off by eps |T| (|H| + W |T H|), W_ji = |L_ji| and what of it cancelled, at most root(N_jj N_ii) / D_i, for
+    i < j: what an error of eps in N = L D L' changes in L_ji, and none where outputs have noises of their own. Noises
+    that are tied leave small D_i, as does the power of a random gain and a mean far from zero; no D_i is below what
+    rounding alone gives to the component.
     """
     m, n = output.shape[:2]
     ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
-    turned, variance = uncorrelated(noise, jnp.concatenate([ones, output], axis=1))
+    whole = noise + diagonal(rounded)
+    turned, pivot = uncorrelated(whole, jnp.concatenate([ones, output], axis=1))
     turn, rows = turned[:, :m], turned[:, m:]
-    deviation, safe = jnp.sqrt(jnp.maximum(diagonal_of(noise), 0.0)), jnp.where(variance > 0, variance, jnp.inf)
+    deviation, safe = jnp.sqrt(jnp.maximum(diagonal_of(whole), 0.0)), jnp.where(pivot > 0, pivot, jnp.inf)
     earlier = np.tri(m, k=-1).reshape(m, m, *[1] * (noise.ndim - 2))
-    of_factor = earlier * deviation[:, None] * (deviation / safe)[None]
-    size = times(jnp.abs(turn), jnp.abs(output) + times(of_factor, jnp.abs(rows)))
+    tied = jnp.minimum(deviation[:, None] * deviation[None], times(jnp.abs(whole), transpose(jnp.abs(turn))))
+    size = times(jnp.abs(turn), jnp.abs(output) + times(earlier * (tied / safe[None]), jnp.abs(rows)))
     reach = times(size, jnp.abs(start))
-    least = ((n + 2) * float(np.finfo(start.dtype).eps) * LEFT) ** 2 * summed(reach * reach, 1)
-    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, least)
+    eps = float(np.finfo(start.dtype).eps)
+    least = ((n + 2) * eps * LEFT) ** 2 * summed(reach * reach, 1)
+    # Variance of each component: by its noise, where that is more than rounding of the noises of z, and by rounding.
+    square, local = turn * turn, times(turn, root(noise))
+    own = summed(local * local, 1)
+    own = jnp.where(own > (LEFT * eps) ** 2 * times_vector(square, diagonal_of(noise)), own, 0.0)
+    variance = jnp.maximum(pivot, times_vector(square, rounded))
+    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, own, least)
 
 
 def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
@@ -139,7 +150,7 @@ def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     )
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
     corrects = ~used & (size > least)
-    step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size, 1.0), column)
+    step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size + component.noise, 1.0), column)
     rounded = rounded - step[:, None] * g[None]
     whole = whole + step[:, None] * (component.number - times_vector(transpose(whole), component.row))[None]
     return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
@@ -175,17 +186,25 @@ def output_rounding(matrix: Array, size: Array) -> Float[jax.Array, " m"]:
     return (len(size) + 2) * float(np.finfo(reach.dtype).eps) * reach
 
 
+def noise_rounding(mean: Array, covariance: Array) -> Float[jax.Array, " m"]:
+    """Deviation of z by the rounding of its noise, 3 eps root E[v_i^2]: also where outputs share it and it cancels."""
+    second = diagonal_of(jnp.asarray(covariance)) + jnp.asarray(mean) ** 2
+    return 3 * float(np.finfo(second.dtype).eps) * jnp.sqrt(second)
+
+
 @runs_last
-def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array) -> jax.Array:
+def above_rounding(after: jax.Array, prior: jax.Array, size: jax.Array, precise: Array | bool = False) -> jax.Array:
     """P and, of each variance of which a precise measurement left next to nothing, what the mean cannot say.
 
     That is ((n + 2) eps)^2 E[x_i^2] of the state at the start, and no more than there was. Noise-free data would else
     shrink P by eps^2 a step, to where a smoother divides the rounding of an innovation by it. A moment from before all
     data at a later step will not do in place of that at the start: of an unstable plant that its inputs hold it grows
-    without end; nor will the mean, on which no covariance of a linear filter depends.
+    without end; nor will the mean, on which no covariance of a linear filter depends. `precise` is true of a
+    measurement that is so by its noise, where P itself, which holds rounding, shrinks by less than one.
 
-    Shapes: after and prior (n, n), size (n,).
+    Shapes: after and prior (n, n), size (n,), precise ().
     """
     left, whole = diagonal_of(after), diagonal_of(prior)
-    precise = left < rounding(PRECISE, after, 1000) * whole
-    return after + diagonal(jnp.where(precise, jnp.minimum(state_rounding(size), whole), 0.0))
+    precise = precise | (left < rounding(PRECISE, after, 1000) * whole)
+    least = jnp.minimum(state_rounding(size), whole)
+    return after + diagonal(jnp.where(precise, jnp.maximum(least - left, 0.0), 0.0))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.linalg import add, cholesky, symmetric, times, transpose
+from heliograph.numerics.linalg import above_products, add, cholesky, symmetric, times, transpose
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array
@@ -90,7 +90,7 @@ class Linearization(AbstractTransform):
 def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Array, jax.Array]:
     """J P J' and P J'."""
     cross = times(covariance, transpose(jacobian))
-    return symmetric(times(jacobian, cross)), cross
+    return above_products(symmetric(times(jacobian, cross)), jacobian, covariance), cross
 
 
 def linear_transform(matrix: Array, center: jax.Array, covariance: jax.Array) -> Transformed:

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
-from heliograph.filters.gaussian.gaussian import corrected, describe
+from heliograph.filters.gaussian.gaussian import corrected, describe, with_known
 from heliograph.filters.gaussian.precise import initial_size, state_rounding
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.plan import plan
@@ -30,7 +30,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import congruence, times, times_vector, transpose
+from heliograph.numerics.linalg import above_products, congruence, times, times_vector, transpose
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
@@ -127,7 +127,7 @@ def moved(
     mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """A m + b and A P A' + Q."""
-    return times_vector(matrix, mean) + shift, congruence(matrix, spread) + noise
+    return times_vector(matrix, mean) + shift, above_products(congruence(matrix, spread), matrix, spread) + noise
 
 
 def within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -155,8 +155,8 @@ def signal(
     covariance, state_mean, state_covariance = known
     cross = times(covariance, transpose(c))
     mean = times_vector(c, state_mean) + noise_mean
-    second = congruence(c, state_covariance) + noise + mean[:, None] * mean[None]
-    return Signal(mean, times(c, cross) + noise, cross, second)
+    second = above_products(congruence(c, state_covariance), c, state_covariance) + noise + mean[:, None] * mean[None]
+    return Signal(mean, above_products(times(c, cross), c, covariance) + noise, cross, second)
 
 
 def corrected_linear(
@@ -164,7 +164,7 @@ def corrected_linear(
 ) -> tuple[LinearBelief, Innovation]:
     """Correct with the components of z that arrived: the signal's mean by the estimate, all else before any data."""
     matrix, mean, noise = map(jnp.asarray, (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
-    before = signal(state[1:], matrix, mean, noise)._replace(matrix=matrix, noise=noise)
+    before = with_known(signal(state[1:], matrix, mean, noise), sensor)
     now = before._replace(mean=matrix @ state.mean + mean)
     after, innovation = corrected(Belief(*state[:2]), now, channel, rule, z, size, unknown=before)
     return state._replace(mean=after.mean, covariance=after.covariance), innovation

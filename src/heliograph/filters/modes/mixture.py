@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
-from heliograph.filters.innovation import log_density, mixed_innovation
+from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import moments_smoother_step
 from heliograph.model.channel import Channel, check_link, received_angles
@@ -22,7 +22,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize, with_rounding
+from heliograph.numerics.linalg import above_products, cholesky, psd_solve, symmetrize, with_rounding
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine, memories
@@ -201,7 +201,8 @@ class MixtureFilter(AbstractSizedFilter):
         """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         transition = plant.transition_matrix(u)
-        spread = transition @ state.covariance @ transition.T + plant.noise_covariance(u)
+        moved = transition @ state.covariance @ transition.T
+        spread = above_products(moved, transition, state.covariance) + plant.noise_covariance(u)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(plant.transition(state.mean, u) + plant.noise_mean(), spread, law, jnp.asarray(True))
 
@@ -225,10 +226,7 @@ class MixtureFilter(AbstractSizedFilter):
             return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
 
         likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
-        # Posterior probabilities p_a N(z; ...), as they were if every combination excludes z.
-        weighed = sharpest(likelihood, certain) + jnp.log(prior)
-        excluded = jnp.max(weighed) == -jnp.inf  # no combination can produce such a value
-        weight = jax.nn.softmax(jnp.where(excluded, jnp.log(prior), weighed))
+        weight, density, excluded = posterior_weights(prior, sharpest(likelihood, certain))
         # Moments of the mixture: P - sum_a w_a K_a S_a K_a' + spread of the means.
         shift = weight @ moved
         apart = moved - shift
@@ -239,7 +237,7 @@ class MixtureFilter(AbstractSizedFilter):
         )
         # Innovation of the mixture, angles near that of the most probable combination.
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
-        innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
+        innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
         after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
         result = MixtureBelief(mean + shift, after, modes, state.moved)

@@ -14,7 +14,13 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
-from heliograph.filters.gaussian.precise import above_rounding, initial_size, output_rounding, state_rounding
+from heliograph.filters.gaussian.precise import (
+    above_rounding,
+    initial_size,
+    noise_rounding,
+    output_rounding,
+    state_rounding,
+)
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -25,7 +31,7 @@ from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import above_products, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stacked
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
@@ -87,7 +93,9 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
-        of_outputs = output_rounding(at(self.sensor, k).matrix, initial_size(at(self.plant, 0)))
+        sensor, size = at(self.sensor, k), initial_size(at(self.plant, 0))
+        of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
+        of_outputs = output_rounding(sensor.matrix, size) + of_noise
         of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
         result: jax.Array = of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
         return result
@@ -122,7 +130,7 @@ class ModalFilter(AbstractModalFilter):
         step, move, noise, centre, rows = self._moves(state, u, k)
         # E[x~ x~' 1{mode}] one step later, and F P F' + the covariance above.
         moments, fresh = _spread_of_moves(state.moments, move, noise, rows)
-        covariance = symmetrize(step @ state.covariance @ step.T + fresh)
+        covariance = symmetrize(above_products(step @ state.covariance @ step.T, step, state.covariance) + fresh)
         # F zeta about the moving centre.
         law = state.moments[:, -1, -1]
         mean = step @ (state.mean - known_part(law, state.centre)) + known_part(law @ rows, centre)
@@ -154,7 +162,8 @@ class ModalFilter(AbstractModalFilter):
         channel = at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
         law = state.moments[:, -1, -1]
-        second = measure @ state.moments @ measure.T + law[:, None, None] * noise
+        sent = jax.vmap(lambda a: above_products(measure @ a @ measure.T, measure, a))(state.moments)
+        second = sent + law[:, None, None] * noise
         random = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
         added = random + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
         observed, common = without_common(gains @ measure, law)
@@ -175,7 +184,7 @@ def _spread_of_moves(
 ) -> tuple[jax.Array, jax.Array]:
     """E[x~ x~' 1{mode}] one step later (M, n + 1, n + 1), and Cov(zeta+ - F zeta) (N, N)."""
     modes, size = len(moments), len(move)
-    carried = move @ moments @ move.T
+    carried = jax.vmap(lambda a: above_products(move @ a @ move.T, move, a))(moments)
     added = (moments[:, -1, -1] @ rows)[:, None, None] * noise
     chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
     fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
@@ -217,12 +226,14 @@ def linear_observation(
     return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
 
 
-def mean_rounding(start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array) -> jax.Array:
+def mean_rounding(
+    start: LinearPlant, law: jax.Array, after: jax.Array, prior: jax.Array, precise: jax.Array | bool = False
+) -> jax.Array:
     """Return what `above_rounding` adds to x = sum_j zeta^j, a part to each mode by its probability: (N, N)."""
     n, size = len(start.initial_mean), initial_size(start)
     projection = sum_of_modes(n, len(law))
     left, whole = (projection @ covariance @ projection.T for covariance in (after, prior))
-    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size) - left))
+    return jnp.kron(jnp.diag(law), padded(above_rounding(left, whole, size, precise) - left))
 
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -18,7 +18,7 @@ from heliograph.filters.gaussian.gaussian import corrected, signal_of
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.side_information import SideInformation, by_pattern, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.channel import Channel, check_link, received_angles
@@ -57,7 +57,8 @@ def receive(
     mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
     # Prior weights given which components arrived.
     chance = weight * jnp.asarray(channel.chance)[mode, kind]
-    prior = chance / jnp.sum(chance)
+    total = jnp.sum(chance)
+    prior = jnp.where(total > 0, chance / jnp.where(total > 0, total, 1.0), weight)
 
     def single(separate: Belief, sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Belief, Innovation]:
         law = QuadraticMap(spread, jnp.zeros_like(spread))
@@ -66,16 +67,15 @@ def receive(
         return corrected(separate, sent, link, Polytope(), z, size, angles)
 
     result, received = jax.vmap(single)(belief, signal, mean, spread)
-    # Posterior weights, log w + log N(z; ...).
-    possible = prior > 0  # a mode in which this cannot arrive has no map for it
+    # Posterior weights; beliefs stay as they are where no mode, or not this one, can produce such a value.
+    weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
+    possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
     after = Belief(
         jnp.where(possible[:, None], result.mean, belief.mean),
         jnp.where(possible[:, None, None], result.covariance, belief.covariance),
     )
-    weighed = jnp.where(possible, jnp.log(prior) + received.log_likelihood, -jnp.inf)
     value = nearest(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
-    mixed = mixed_innovation(prior, value, received.covariance, jax.nn.logsumexp(weighed))
-    return after, jax.nn.softmax(weighed), mixed
+    return after, weights, mixed_innovation(prior, value, received.covariance, density)
 
 
 def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], SideInformation | OverTime]:
@@ -159,7 +159,8 @@ class MergeByMode(AbstractMerging):
 def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
     """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
     law = jnp.sum(weight, axis=0)
-    share = jnp.where(law > 0, weight * (1 / jnp.where(law > 0, law, 1.0)), 1 / len(weight))
+    some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
+    share = jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
     center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
     apart = mean[:, None] - center
     inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]

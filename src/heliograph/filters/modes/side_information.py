@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
-from heliograph.filters.gaussian.correction import absent, gain_and_bound
+from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.modal import (
     joined,
@@ -152,11 +152,11 @@ class SideInformationFilter(AbstractSizedFilter):
         moments = weight[:, None, None] * state.moments / total
         prior = _projected(state._replace(moments=moments), size)
         # Kalman update of zeta with the components that arrived, and the rounding of the mean.
-        after, value, covariance = _used(
+        after, value, covariance, precise = _used(
             prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there
         )
         law = after.moments[:, size - 1, size - 1]
-        shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance)
+        shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance, precise)
         errors = slice(-len(after.mean), None)
         after = after._replace(moments=after.moments.at[:, errors, errors].add(law[:, None, None] * shares))
         likelihood = log_density(value, covariance, jnp.abs(z) + jnp.abs(value))
@@ -216,8 +216,8 @@ def _used(
     spread: jax.Array,
     z: jax.Array,
     there: jax.Array,
-) -> tuple[SideInformationBelief, jax.Array, jax.Array]:
-    """Update with what arrived, e+ = (I - K H) e - K noise; returns the innovation and its covariance too."""
+) -> tuple[SideInformationBelief, jax.Array, jax.Array, jax.Array]:
+    """Update by e+ = (I - K H) e - K noise; returns the innovation and covariance, and if it is precise."""
     measure, noise = measured_about(sensor, state.centre)
     size = measure.shape[1]
     # Cov(z | zeta, mode) = T_j(E[y y' 1{j}]) + P(j) Hbar_j R~ Hbar_j'.
@@ -241,7 +241,8 @@ def _used(
     noise_of = jax.vmap(spread_of, in_axes=(None, 0))(gain, added)
     moments = moments.at[:, size:, size:].add(jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), noise_of))
     after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
-    return after, value, total
+    fresh = jnp.where(there[:, None] & there, jnp.sum(added, axis=0), 0.0) + absent(there)
+    return after, value, total, is_precise(seen, fresh)
 
 
 def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
