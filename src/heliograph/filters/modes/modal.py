@@ -93,11 +93,8 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
-        sensor, size = at(self.sensor, k), initial_size(at(self.plant, 0))
-        of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
-        of_outputs = output_rounding(sensor.matrix, size) + of_noise
-        of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
-        result: jax.Array = of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
+        of_z = received_rounding(at(self.sensor, k), initial_size(at(self.plant, 0)), gains)
+        result: jax.Array = of_z + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
         return result
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
@@ -224,6 +221,14 @@ def linear_observation(
         jnp.where(present, rounded, 0.0),
     )
     return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
+
+
+def received_rounding(sensor: LinearSensor, size: jax.Array, gains: jax.Array) -> jax.Array:
+    """Variance (m,) that rounding gives to z by what the outputs are off, behind the greatest of the modes' gains."""
+    of_noise = noise_rounding(sensor.noise.mean, sensor.noise.covariance)
+    of_outputs = output_rounding(sensor.matrix, size) + of_noise
+    largest: jax.Array = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
+    return largest**2
 
 
 def mean_rounding(

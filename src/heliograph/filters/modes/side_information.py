@@ -10,6 +10,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
+from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.modal import (
     joined,
@@ -17,6 +18,7 @@ from heliograph.filters.modes.modal import (
     measured_about,
     moved_about,
     padded,
+    received_rounding,
     sum_of_modes,
     without_common,
 )
@@ -28,7 +30,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import pseudo_solve, spread_of, symmetrize
+from heliograph.numerics.linalg import PRECISE, pseudo_solve, rounding, spread_of, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
@@ -153,8 +155,9 @@ class SideInformationFilter(AbstractSizedFilter):
         prior = _projected(state._replace(moments=moments), size)
         # Kalman update of zeta with the components that arrived, and the rounding of the mean.
         after, value, covariance, precise = _used(
-            prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there
-        )
+            prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there,
+            received_rounding(sensor, initial_size(at(self.plant, 0)), jnp.asarray(known.mean)[:, kind]),
+        )  # fmt: skip
         law = after.moments[:, size - 1, size - 1]
         shares = mean_rounding(at(self.plant, 0), law, after.covariance, prior.covariance, precise)
         errors = slice(-len(after.mean), None)
@@ -200,10 +203,14 @@ def _rounding(size: jax.Array, moments: jax.Array) -> jax.Array:
 
 
 def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
-    """Best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
+    """Best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+.
+
+    Moments of e are exact under any D. Directions of s of next to no variance are left as they are: what the products
+    of moments leave of rounding there would be divided by it.
+    """
     count, total = len(state.mean), jnp.sum(state.moments, axis=0)
     known = slice(size - 1, size + count)
-    change = pseudo_solve(total[known, known], total[known, -count:]).T
+    change = pseudo_solve(total[known, known], total[known, -count:], rounding(PRECISE, total, 1000)).T
     turn = jnp.eye(len(total)).at[size:-count, known].add(change).at[-count:, known].add(-change)
     moments = _turned(turn, state.moments, count)
     return state._replace(mean=state.mean + change @ jnp.append(1.0, state.mean), moments=moments)
@@ -216,14 +223,16 @@ def _used(
     spread: jax.Array,
     z: jax.Array,
     there: jax.Array,
+    of_z: jax.Array,
 ) -> tuple[SideInformationBelief, jax.Array, jax.Array, jax.Array]:
     """Update by e+ = (I - K H) e - K noise; returns the innovation and covariance, and if it is precise."""
     measure, noise = measured_about(sensor, state.centre)
     size = measure.shape[1]
-    # Cov(z | zeta, mode) = T_j(E[y y' 1{j}]) + P(j) Hbar_j R~ Hbar_j'.
+    # Cov(z | zeta, mode) = T_j(E[y y' 1{j}]) + P(j) Hbar_j R~ Hbar_j', and the rounding of z.
     law = state.moments[:, size - 1, size - 1]
     second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
     added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
+    added = added + law[:, None, None] * jnp.diag(of_z)
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = without_common(mean @ measure, law)
     output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
