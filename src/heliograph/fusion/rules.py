@@ -282,7 +282,8 @@ class Fusion(Module):
         rule: the fusion rule.
         quantizer: of each node's mean on its way to the fusion centre or to its neighbours; one for all nodes, or one
             for each by its name, all of one kind; None by default. The covariance is widened by the quantizer's error.
-            Covariances are assumed to arrive as they are: most are computed before any data.
+            Between neighbours a mean beyond its amplitude does not arrive, and the claim is "nominal". Covariances are
+            assumed to arrive as they are: most are computed before any data.
         uplink: the link of the quantized mean, for rules that use reports (`AllReports`); one for all nodes, or one for
             each node by its name; None by default.
         neighbours: names of those whom each node receives, such as {"a": ["b", "c"], "b": []}, or a networkx graph of

@@ -66,15 +66,16 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
-    Weaker where laws are known up to a radius, weights are frozen means over losses, or a sender decides by what it
-    measured.
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
+    sender by what it measured, a quantizer by what it cannot send.
     """
     parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
              for node in network.mesh_nodes(name)
              if isinstance(item := network.nodes[node], Node)}  # fmt: skip
     known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
     senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
-    if isinstance(fusion.rule, FrozenWeights) or any(item.trigger is not None for item in senders):
+    by_data = fusion.quantizer is not None or any(item.trigger is not None for item in senders)
+    if by_data or isinstance(fusion.rule, FrozenWeights):
         return "nominal"
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
