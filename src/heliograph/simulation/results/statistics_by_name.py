@@ -44,7 +44,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
     separately.
 
     Args:
-        result: statistics by node and filter.
+        by_node: statistics by node and filter.
         states: names of the plant's states.
         units: by the state's name; by default those that the names have.
     """
