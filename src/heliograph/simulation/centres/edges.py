@@ -130,9 +130,9 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
         wrong = sorted(set(fusion.link) ^ set(names))[:3]
         raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
     channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
-    each = isinstance(fusion.link, Mapping)
+    several = isinstance(fusion.link, Mapping)
     for name, channel in {id(c): (name, c) for name, c in zip(names, channels, strict=True)}.values():
-        check_edge(f"link {name!r}" if each else "link between neighbours", channel)
+        check_edge(f"link {name!r}" if several else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     groups, past = channel_groups(dict(zip(names, channels, strict=True))), max(first(c).past for c in channels)
     return Edges(groups, slots, graph.present, fusion.rounds, past)

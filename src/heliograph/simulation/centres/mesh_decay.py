@@ -46,9 +46,9 @@ def check_decay(
     arrives = np.zeros(graph.present.shape)
     arrives[:, 1:][graph.present[:, 1:]] = arrival
     pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
-    own = -pulled - p[:, None] @ squares[graph.senders] @ a
+    pushed = -pulled - p[:, None] @ squares[graph.senders] @ a
     mean = arrives[:, :, None, None] * pulled
-    mean[:, 0] = a - p @ squares @ a + (arrives[:, :, None, None] * own)[:, 1:].sum(axis=1)
+    mean[:, 0] = a - p @ squares @ a + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
     ends = np.concatenate([[0], np.cumsum(graph.present.sum(axis=1))])
     m = bsr_array((mean[graph.present], graph.senders[graph.present], ends), shape=(nodes * n,) * 2, blocksize=(n, n))
     spread = (arrives * (1 - arrives))[:, :, None, None]
@@ -56,11 +56,11 @@ def check_decay(
     joint, sizes, places = np.eye(nodes * n), [], np.arange(nodes)
     for _ in range(STEPS):
         blocks = joint.reshape(nodes, n, nodes, n)
-        one, two = places[:, None], graph.senders
-        cross = own @ blocks[one, :, two, :] @ pulled.swapaxes(2, 3)
-        same = own @ blocks[one, :, one, :] @ own.swapaxes(2, 3) + pulled @ blocks[two, :, two, :] @ pulled.swapaxes(
-            2, 3
-        )
+        receivers, senders = places[:, None], graph.senders
+        cross = pushed @ blocks[receivers, :, senders, :] @ pulled.swapaxes(2, 3)
+        same = pushed @ blocks[receivers, :, receivers, :] @ pushed.swapaxes(2, 3) + pulled @ blocks[
+            senders, :, senders, :
+        ] @ pulled.swapaxes(2, 3)
         more = (spread * (same + cross + cross.swapaxes(2, 3))).sum(axis=1)
         joint = m @ np.ascontiguousarray((m @ joint).T)
         joint.reshape(nodes, n, nodes, n)[places, :, places, :] += more
