@@ -240,7 +240,7 @@ def _check_regular(where: str, noise: np.ndarray) -> None:
 
 
 def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
-    """Refuse fixed shares with which errors grow, of a plant that does not decay, with gains that settle."""
+    """Refuse fixed shares with which errors grow, where the plant does not decay and gains become steady."""
     plant, link, names = network.plant, fusion.link, graph.nodes
     if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:
         return
@@ -249,15 +249,15 @@ def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) ->
     rates = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
              for j, i in graph.edges]  # fmt: skip
     arrival = np.array([p for p in rates if p is not None])
-    settles = all(_settles(item) for item in items if isinstance(item, Node))
-    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not settles:
+    steady = all(_is_steady(item) for item in items if isinstance(item, Node))
+    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
     models = [_model(item) if isinstance(item, Node) else (np.zeros((1, len(a))), np.eye(1)) for item in items]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
 
 
-def _settles(item: Node) -> bool:
+def _is_steady(item: Node) -> bool:
     """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
     if isinstance(item.sensor, OverTime) or isinstance(item.channel, OverTime):
         return False
