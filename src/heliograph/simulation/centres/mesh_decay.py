@@ -32,42 +32,55 @@ def check_decay(
     Raises:
         ValueError: errors that grow, by the name of the node where they are largest.
     """
+    arrives = np.zeros(graph.present.shape)
+    arrives[:, 1:][graph.present[:, 1:]] = arrival
+    growth, sizes = _growth(graph, arrives, *_steps(graph, shares, plant, squares))
+    if growth > 1 + SLOW:
+        raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
+                   f"squares that grow by {growth:.3g} a step at node {graph.nodes[sizes.argmax()]!r}")  # fmt: skip
+
+
+def _steps(
+    graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Step of a node's error: alone (node, n, n), and what a message adds of the sender's and of its (node, degree)."""
     a, q = plant
-    nodes, n = len(graph.nodes), len(a)
-    # Gains of a filter that receives all its neighbours' measurements, after it has settled.
-    there = graph.present[:, :, None, None]
-    total = np.where(there, squares[graph.senders], 0.0).sum(axis=1)
-    p = np.tile(np.eye(n), (nodes, 1, 1))
+    n = len(a)
+    # Gains of a filter that receives all its neighbours' measurements, in the long run.
+    total = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
+    p = np.tile(np.eye(n), (len(squares), 1, 1))
     for _ in range(STEPS):
         before = a @ p @ a.T + q
         p = np.linalg.solve(np.eye(n) + before @ total, before)
         p = (p + p.swapaxes(1, 2)) / 2
-    # What each edge adds to the error of its receiver: from the sender's and from its own.
-    arrives = np.zeros(graph.present.shape)
-    arrives[:, 1:][graph.present[:, 1:]] = arrival
+    # c_ij F_i A e_j, and -c_ij F_i A e_i - P_i S_j A e_i.
     pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
-    pushed = -pulled - p[:, None] @ squares[graph.senders] @ a
+    return a - p @ squares @ a, pulled, -pulled - p[:, None] @ squares[graph.senders] @ a
+
+
+def _growth(
+    graph: Graph, arrives: np.ndarray, alone: np.ndarray, pulled: np.ndarray, pushed: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Growth of the errors' second moments in a step, and in the end their sizes by node."""
+    nodes, n = alone.shape[:2]
+    # Mean over what gets lost, and its variance.
     mean = arrives[:, :, None, None] * pulled
-    mean[:, 0] = a - p @ squares @ a + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
+    mean[:, 0] = alone + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
     ends = np.concatenate([[0], np.cumsum(graph.present.sum(axis=1))])
     m = bsr_array((mean[graph.present], graph.senders[graph.present], ends), shape=(nodes * n,) * 2, blocksize=(n, n))
-    spread = (arrives * (1 - arrives))[:, :, None, None]
+    variance = (arrives * (1 - arrives))[:, :, None, None]
     # Second moments without noise, in units of their size before a step.
-    joint, sizes, places = np.eye(nodes * n), [], np.arange(nodes)
+    joint, logarithms, places, senders = np.eye(nodes * n), [], np.arange(nodes), graph.senders
+    both = np.concatenate([pushed, pulled], axis=3)
     for _ in range(STEPS):
         blocks = joint.reshape(nodes, n, nodes, n)
-        receivers, senders = places[:, None], graph.senders
-        cross = pushed @ blocks[receivers, :, senders, :] @ pulled.swapaxes(2, 3)
-        same = pushed @ blocks[receivers, :, receivers, :] @ pushed.swapaxes(2, 3) + pulled @ blocks[
-            senders, :, senders, :
-        ] @ pulled.swapaxes(2, 3)
-        more = (spread * (same + cross + cross.swapaxes(2, 3))).sum(axis=1)
+        cross = blocks[places[:, None], :, senders, :]
+        top = np.concatenate([np.broadcast_to(blocks[places, :, places, :][:, None], cross.shape), cross], axis=3)
+        below = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
+        more = both @ np.concatenate([top, below], axis=2) @ both.swapaxes(2, 3)
         joint = m @ np.ascontiguousarray((m @ joint).T)
-        joint.reshape(nodes, n, nodes, n)[places, :, places, :] += more
-        sizes.append(np.trace(joint))
-        joint /= sizes[-1]
-    growth = np.exp(np.mean(np.log(sizes[-LAST:])))
-    if growth > 1 + SLOW:
-        worst = np.einsum("iaia->i", joint.reshape(nodes, n, nodes, n)).argmax()
-        raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
-                   f"squares that grow by {growth:.3g} a step at node {graph.nodes[worst]!r}")  # fmt: skip
+        joint.reshape(nodes, n, nodes, n)[places, :, places, :] += (variance * more).sum(axis=1)
+        # Their size, of which the next step is a multiple.
+        logarithms.append(np.log(np.trace(joint)))
+        joint /= np.trace(joint)
+    return float(np.exp(np.mean(logarithms[-LAST:]))), np.einsum("iaia->i", joint.reshape(nodes, n, nodes, n))
