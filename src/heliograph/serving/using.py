@@ -68,7 +68,7 @@ class Using:
             spoilt = set()
             for i, why in result.items():
                 number, plant, event, _ = self._taken[i]
-                self._refused[number, event.place < 0] = why
+                self._refused[number, event.node_index < 0] = why
                 spoilt.add(plant.name)
             for name in spoilt:
                 self._undo(name)
@@ -106,7 +106,7 @@ class Using:
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
         # Values beyond limits do not count as received; an event of such values only is implausible.
         event, dropped, beyond = self._within(message.node, event)
-        why = self._refused.get((number, event.place < 0)) or (beyond if np.isnan(event.values).all() else "")
+        why = self._refused.get((number, event.node_index < 0)) or (beyond if np.isnan(event.values).all() else "")
         spoilt = self._refused.get((number, True)) if inputs is not None else None
         if plant is None:
             if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
