@@ -157,7 +157,8 @@ class Sweeper:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         with jax.enable_x64(True):
-            self._numbers, static = cast(Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds))
+            self.sweep = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
+            self._numbers, static = cast(self.sweep)
         self._run = sweep_back(static, dt)
 
     def _fuses(self, fusion: Fused, kinds: tuple[int, ...]) -> bool:

@@ -233,7 +233,7 @@ class Service:
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
         entries += self._finals(finalised)
-        provisional = self._provisional([item for item in finalised if item.plant.name in used])
+        provisional = self._provisional([row for row in finalised if row.plant.name in used])
         self.fleet.forget(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
@@ -275,16 +275,16 @@ class Service:
     def _load(self, names: Iterable[str]) -> None:
         """Load the plants of these names from the store, if it keeps any."""
         self._damage = {}
-        for name, item in self.store.load([name for name in names if name not in self.plants]).items():
-            if item.damage:
-                self._damage[name] = item.damage
+        for name, stored in self.store.load([name for name in names if name not in self.plants]).items():
+            if stored.damage:
+                self._damage[name] = stored.damage
                 continue
-            plant = self.plants[name] = plant_from(name, item.body, self.fleet)
-            plant.version = item.version
+            plant = self.plants[name] = plant_from(name, stored.body, self.fleet)
+            plant.version = stored.version
 
     def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
-        rows = [(item.plant, row) for item in finalised for row in item.final if row.has_data()]
+        rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
         outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [
             Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
@@ -293,7 +293,7 @@ class Service:
 
     def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
         """Return the provisional estimates at the newest rows."""
-        outputs = self.fleet.outputs([item.newest.slot for item in finalised])
+        outputs = self.fleet.outputs([row.newest.slot for row in finalised])
         return [
             Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
             for (plant, _, newest, _), numbers in zip(finalised, outputs, strict=True)
