@@ -156,7 +156,7 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     return StepProgram(
         filter=filter,
         graph=graph,
-        leaves=[Leaf(*part) for part in parts],
+        leaves=[Leaf(*fields) for fields in parts],
         z=of_z,
         u=of_u,
         k=of_k,
