@@ -93,9 +93,9 @@ def best_within(
 ) -> Float[np.ndarray, "time Fn R"]:
     """Gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
-    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local_gains`, over the gains of all steps
-    at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that happens
-    to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
+    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local_gains`, over the gains of all
+    steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
+    happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
     """
     whole = float(_judge(problem, local_gains)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
