@@ -62,9 +62,9 @@ class Exchange:
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])
-        before = central[self._name].before
+        mean, covariance = self._node.sent(central[self._name].before)
         measurement = row.numbers[: self._node.measured[0]]
-        values = np.concatenate([before.mean[0], np.ravel(before.covariance[0]), measurement]).tolist()
+        values = np.concatenate([mean, np.ravel(covariance), measurement]).tolist()
         time = int(row.key[0])
         message = {"plant": plant.name, "node": network.names[0], "sequence": time, "values": values}
         body = to_json(message | {"time": self._moment(plant, row.key[0])}, inf_nan_mode="null")

@@ -95,6 +95,8 @@ class DiffusionWeights(_OfNeighbours):
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
         """Return the rule with its shares (degree, row) of the graph's rows, zero for the node itself."""
+        if unknown := sorted(set(self.given or {}) - set(graph.nodes)):
+            raise fail("diffusion shares", f"those of nodes of the fusion {list(graph.nodes)[:5]}", unknown)
         shares = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
         for i, senders in enumerate(graph.senders if self.given is not None else ()):
             name, *others = (graph.nodes[j] for j in senders[graph.present[i]])

@@ -56,6 +56,15 @@ def moved_beyond(
     return jnp.zeros(len(off), dtype=bool).at[senders[:, 1:]].max(moving)
 
 
+def quantized(
+    quantizer: AbstractQuantizer, mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"]
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
+    """Return what a node sends of an estimate: quantized, and wider; NaN where it is beyond the amplitude."""
+    value = quantizer.step((), mean)[1]
+    received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)
+    return received, widen(covariance, jnp.asarray(quantizer.error(len(mean))))
+
+
 def messages_of(
     mean: jax.Array, covariance: jax.Array, way: OnTheWay, quantizer: AbstractQuantizer | None, senders: np.ndarray,
     ages: Int[jax.Array, "node rounds degree"],
@@ -67,10 +76,7 @@ def messages_of(
     """
     sent = mean, covariance
     if quantizer is not None:
-        both = eqx.filter_vmap(lambda q, x: q.step((), x)[1], in_axes=(eqx.if_array(0), 0))(quantizer, mean)
-        error = eqx.filter_vmap(lambda q: q.error(mean.shape[-1]), in_axes=(eqx.if_array(0),))(quantizer)
-        beyond = jnp.any(both.saturated, axis=1, keepdims=True)
-        sent = jnp.where(beyond, jnp.nan, both.value), jax.vmap(widen)(covariance, error)
+        sent = eqx.filter_vmap(quantized, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
     means, covariances = (
         jnp.concatenate([alone, now, part.reshape(-1, *alone.shape[1:])])
         for alone, now, part in zip((mean, covariance), sent, way, strict=True)
