@@ -77,6 +77,7 @@ def design(
         problem = network
     if problem.error is not None:
         instance("error", problem.error, Error, "an Error")
+    # One way for each kind of network.
     designable = problem.network
     if isinstance(designable, RelayNetwork):
         return design_relays(problem, designable)
@@ -84,9 +85,8 @@ def design(
         return _design_powers(problem)
     if callable(designable):
         return design_numbers(problem, designable)
-    raise fail(
-        "network", "a Network, a RelayNetwork, Paths or a function that returns a Network", type(designable).__name__
-    )
+    expected = "a Network, a RelayNetwork, Paths or a function that returns a Network"
+    raise fail("network", expected, type(designable).__name__)
 
 
 def _design_powers(problem: DesignProblem) -> PowerDesign:
@@ -105,11 +105,8 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         states = network.states
     else:
         assert isinstance(network, Paths)
-        paths, fixed, states = (
-            network,
-            np.zeros(network.kappa.shape),
-            tuple(f"x{i}" for i in range(network.rows.shape[-1])),
-        )
+        paths, fixed = network, np.zeros(network.kappa.shape)
+        states = tuple(f"x{i}" for i in range(network.rows.shape[-1]))
         if error.steps != len(paths.kappa) or (error.horizon is None) != (paths.plants.start is None):
             raise fail("error", f"that over {len(paths.kappa)} steps for which the paths were made", f"{error.steps}")
         if problem.free is not None:
