@@ -61,7 +61,7 @@ def native(
             raise
         raise Unsupported("a network with an object that cannot be compared with another") from None
     if isinstance(made, Unsupported):
-        raise Unsupported(made.operation, made.place)
+        raise Unsupported(made.operation, made.where)
     program, form = made
     words = np.asarray(jax.random.key_data(key))
     return Native(program.begin([words, *(a for a in arrays if _is_given(a))]), form)
