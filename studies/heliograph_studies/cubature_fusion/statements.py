@@ -4,9 +4,9 @@ import numpy as np
 
 import heliograph as hg
 from heliograph_studies.cubature_fusion import one_step
-from heliograph_studies.cubature_fusion.boundedness import growth_condition
 from heliograph_studies.cubature_fusion.compute import Outcome, Runs
 from heliograph_studies.cubature_fusion.errata import errata, ratio, rmse, worst
+from heliograph_studies.cubature_fusion.one_step import growth_condition
 from heliograph_studies.cubature_fusion.setting import NODES, Scenario, plant
 from heliograph_studies.statement import Sampled, Statement, holds, if_met, vacuous
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 import heliograph as hg
+from heliograph_studies.h_infinity_fusion.compute import Parts
 from heliograph_studies.h_infinity_fusion.example import RECURSIVE
 from heliograph_studies.h_infinity_fusion.levels import published_fused_level
-from heliograph_studies.h_infinity_fusion.parts import Parts
 from heliograph_studies.h_infinity_fusion.setting import PAPER_FUSED_LEVEL, PAPER_WEIGHTS
 from heliograph_studies.statement import Sampled, Statement, holds
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PALE, PURPLE, STYLE, VERMILION, WIDTH
 from heliograph_studies.curves import Curve, Panel, curves_over_time
-from heliograph_studies.h_infinity_fusion import structured
-from heliograph_studies.h_infinity_fusion.compute import Outcome
+from heliograph_studies.h_infinity_fusion import discriminating
+from heliograph_studies.h_infinity_fusion.compute import Outcome, Parts
 from heliograph_studies.h_infinity_fusion.discriminating import NODE
 from heliograph_studies.h_infinity_fusion.example import (
     MORE_QUANTIZERS,
@@ -19,7 +19,6 @@ from heliograph_studies.h_infinity_fusion.example import (
     arrivals,
     fused_name,
 )
-from heliograph_studies.h_infinity_fusion.parts import Parts
 from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
 
 NODE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
@@ -144,9 +143,9 @@ def _second_errors(result: Parts) -> Figure:
     names, second = ("horizon", "recursive", "ekf_statistics", "ekf_known", "open_loop"), result.discriminating
     panels = [
         Panel(f"error, {scenario}", [Curve(LABELS[n], COLOURS[n], second.over_time[scenario][n]) for n in names])
-        for scenario in structured.SCENARIOS
+        for scenario in discriminating.SCENARIOS
     ]
-    return curves_over_time(np.arange(structured.STEPS), panels, "step")
+    return curves_over_time(np.arange(discriminating.STEPS), panels, "step")
 
 
 @matplotlib.rc_context(STYLE)
@@ -179,7 +178,7 @@ def words(outcome: Outcome) -> dict[str, object]:
         "node": NODE,
         "nodes": NODES,
         "links": LINKS,
-        "scenarios": structured.SCENARIOS,
+        "scenarios": discriminating.SCENARIOS,
         "colours": COLOURS,
         "labels": LABELS,
         "key_colours": (BLUE, VERMILION, GREEN),

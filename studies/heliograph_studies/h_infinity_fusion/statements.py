@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from heliograph_studies.h_infinity_fusion.compute import Outcome
+from heliograph_studies.h_infinity_fusion.compute import Outcome, Parts
 from heliograph_studies.h_infinity_fusion.discriminating import NODE
 from heliograph_studies.h_infinity_fusion.errata import errata
 from heliograph_studies.h_infinity_fusion.example import RECURSIVE, arrivals
 from heliograph_studies.h_infinity_fusion.indices import ZERO
-from heliograph_studies.h_infinity_fusion.parts import Parts
 from heliograph_studies.statement import Sampled, Statement, holds, if_met, vacuous
 
 OURS = "not in the paper"

@@ -11,9 +11,18 @@ from scipy import stats
 import heliograph as hg
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import compiled
-from heliograph_studies.motor_drive.drive import Drive, simulate_drive
 from heliograph_studies.motor_drive.listeners import network, received
-from heliograph_studies.motor_drive.machine import RATED, ROTOR_RESISTANCE, STEP, Machine, draw_truth, euler, plant
+from heliograph_studies.motor_drive.machine import (
+    RATED,
+    ROTOR_RESISTANCE,
+    STEP,
+    Drive,
+    Machine,
+    draw_truth,
+    euler,
+    plant,
+    simulate_drive,
+)
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
 

@@ -1,16 +1,67 @@
 """Quadratic filtering with dynamical bias under amplify-and-forward relays, reproduced and repaired; see README.md."""
 
-from heliograph_studies.quadratic_bias import compute, figures, statements
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies.curves import Curve, Panel, curves_over_time
+from heliograph_studies.quadratic_bias import compute, statements
+from heliograph_studies.quadratic_bias.compute import CLAIMED, NODE, TRUE, Numbers, Outcome
 from heliograph_studies.quadratic_bias.setting import Setting as Setting
 from heliograph_studies.study import Study
+
+COLOURS = {
+    "linear": VERMILION, CLAIMED: MUTED, TRUE: AMBER, "quadratic": BLUE, "memory": AMBER, "cubic": PURPLE,
+    "quartic": MUTED, "mixture": GREEN,
+}  # fmt: skip
+LABELS = {TRUE: "printed, true", CLAIMED: "printed, claimed"}
+
+
+def figures(outcome: Outcome) -> dict[str, Figure]:
+    """Figs 1 to 6 by file name, and our scenario."""
+    example, outage = outcome.example, outcome.outage
+    drawn = {}
+    for i, state in enumerate(example.model.states[:2]):
+        variances = {name: by_state[state] for name, by_state in example.covariance.items()}
+        errors = {name: values[:, i] for name, values in example.errors.items()}
+        names = ("linear", "quadratic", "memory", "cubic", "quartic")
+        drawn[f"fig{1 + i}_{state}"] = _trajectory(example, i, state)
+        drawn[f"fig{3 + i}_covariance_{state}"] = _over_time(f"error variance of {state}", variances, names)
+        drawn[f"fig{5 + i}_mse_{state}"] = _over_time(
+            f"mean squared error of {state}", errors, ("linear", "quadratic", "cubic", "mixture"), begin=1
+        )
+    variances = {name: by_state["x"] for name, by_state in outage.covariance.items()}
+    drawn["outage"] = _over_time("error variance of x", variances, ("linear", CLAIMED, TRUE, "quadratic"))
+    return drawn
+
+
+def _trajectory(example: Numbers, i: int, state: str) -> Figure:
+    assert example.run.truth is not None
+    true = Curve("true", INK, example.run.truth[0, :, i])
+    means = {name: example.run.estimates[NODE][name].mean[0, :, i] for name in ("quadratic", "mixture")}
+    panels = [Panel(state, [true, Curve(name, COLOURS[name], np.asarray(mean))]) for name, mean in means.items()]
+    return curves_over_time(example.run.time, panels, "t")
+
+
+def _over_time(label: str, values: Mapping[str, np.ndarray], names: Sequence[str], begin: int = 0) -> Figure:
+    curves = [Curve(LABELS.get(name, name), COLOURS[name], values[name]) for name in names]
+    return curves_over_time(np.arange(begin, begin + len(values[names[0]])), [Panel(label, curves)], "t")
+
+
+def words(outcome: Outcome) -> dict[str, object]:
+    """Labels and colours by filter, in the order of the tables."""
+    return {"colours": COLOURS, "labels": LABELS, "claimed": CLAIMED, "printed": TRUE}
+
 
 publication = Study(
     name="quadratic-bias",
     setting=Setting,
     compute=compute.compute,
     stages=3,
-    figures=figures.figures,
-    words=figures.words,
+    figures=figures,
+    words=words,
     publication="Quadratic filtering with dynamical bias under amplify-and-forward relays",
     statements=statements.statements,
     data=compute.write_record,

@@ -15,9 +15,18 @@ from heliograph_studies import demo
 from heliograph_studies.demo import compute as compute_module
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import NAMES, Design, Outcome, average_noise, channel_less, relay
-from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, first_half, learn, relayed, single
+from heliograph_studies.demo.learned import (
+    FIRST_GUESS,
+    HELD,
+    Learned,
+    direct,
+    first_half,
+    learn,
+    relayed,
+    score,
+    single,
+)
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
-from heliograph_studies.demo.scores import score
 from heliograph_studies.markdown import filled
 from heliograph_studies.stages import Stages
 from heliograph_studies.study import no_progress
