@@ -24,6 +24,7 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.cubature_fusion.setting import (
     NODES,
     STATES,
@@ -36,8 +37,6 @@ from heliograph_studies.cubature_fusion.setting import (
     plant,
     sensor,
 )
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
 
 
 class AbstractReading(AbstractUpdate):

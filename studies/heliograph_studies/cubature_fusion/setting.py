@@ -13,8 +13,9 @@ from heliograph.filters.gaussian.correction import Signal, as_array, as_scalars,
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.gaussian.update import AbstractUpdate, interval_description
-from heliograph.numerics.check import check_count, check_seed
+from heliograph.numerics.check import check_count
 from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph_studies import check_fields
 
 
 class LooseInterval(AbstractUpdate):
@@ -140,10 +141,7 @@ class Setting:
     early_factor: int = 20
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 10)  # with fewer a standard error means nothing
-        check_seed("seed", self.seed)
-        for name, least in (("early", 1), ("early_factor", 1)):
-            check_count(name, getattr(self, name), least)
+        check_fields(self, runs=10, early=1, early_factor=1)  # with fewer runs a standard error means nothing
         for s in (self.printed, self.strong):
             check_count(f"{s.name}.horizon", s.horizon, 10)  # the errata look at step 10
 

@@ -7,12 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, VERMILION
+from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields
 from heliograph_studies.curves import Curve, Panel, curves_over_time
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 
 STEPS = 60
 LAW = hg.Discrete([0, 1, 2], [0.4, 0.35, 0.25])
@@ -42,9 +39,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("late_runs", self.late_runs, 2)
-        check_count("clock_runs", self.clock_runs, 2)
-        check_seed("seed", self.seed)
+        check_fields(self, late_runs=2, clock_runs=2)
 
 
 def moving(

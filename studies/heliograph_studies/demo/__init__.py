@@ -4,13 +4,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies import Study
 from heliograph_studies.curves import Curve, consistency_over_time, errors_with_bands, paths
 from heliograph_studies.demo import compute, robot
 from heliograph_studies.demo.compute import NAMES, Outcome
 from heliograph_studies.demo.compute import Setting as Setting
 from heliograph_studies.demo.learned import position_nees
 from heliograph_studies.demo.recording import CALIBRATED, WINDOW
-from heliograph_studies.study import Study
 
 COLOURS = dict(zip(NAMES, (BLUE, PURPLE, VERMILION, GREEN, MUTED), strict=True))
 LABELS = {name: name.replace("_", " ").replace("relay aware", "relay-aware") for name in NAMES}

@@ -10,14 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import apply
+from heliograph_studies import Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.learned import Learned, Score, learn, score
 from heliograph_studies.demo.recording import PlazaRecording, find_recording, read_recording
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("seeds", self.seeds)
-        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + self.seeds - 1)
+        check_fields(self, seeds=1)
         self.files()
 
     def files(self) -> list[Path]:

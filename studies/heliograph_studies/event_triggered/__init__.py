@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.numerics.check import TINY, check_count, check_seed, scalar
+from heliograph.numerics.check import TINY
 from heliograph.planning.messages import least_error, simulated_rate
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
+from heliograph_studies import Stages, Study, check_fields
 
 ROOMS = ("hall", "kitchen", "living room", "study", "bedroom", "nursery", "bath", "attic", "cellar", "garage")
 
@@ -36,13 +35,9 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        scalar("delta", self.delta, TINY)
-        scalar("noise", self.noise, TINY)
-        for name in ("fail", "recover"):
-            scalar(name, getattr(self, name), TINY, 1.0)
-        for name, least in (("heartbeat", 1), ("hours", 1), ("runs", 2)):
-            check_count(name, getattr(self, name), least)
-        check_seed("seed", self.seed)
+        probability = (TINY, 1.0)
+        check_fields(self, delta=(TINY,), noise=(TINY,), fail=probability, recover=probability)
+        check_fields(self, heartbeat=1, hours=1, runs=2)
 
     @property
     def trigger(self) -> hg.SendOnDelta:

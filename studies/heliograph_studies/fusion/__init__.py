@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, STYLE, VERMILION, WIDTH, legend_above
+from heliograph_studies import Study
 from heliograph_studies.fusion import compute
 from heliograph_studies.fusion.compute import Outcome
 from heliograph_studies.fusion.compute import Setting as Setting
-from heliograph_studies.study import Study
 
 DRAWN = {"three_partial": BLUE, "three_rooms": AMBER, "four_equal": PURPLE}
 LABELS = {

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import fail
+from heliograph_studies import Inline, Stages, Unlisted, check_fields
 from heliograph_studies.cubature_fusion import setting as machine
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
 
 Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
 
@@ -41,16 +40,11 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 8)
-        for name in ("steps", "measured_steps", "crossed_nodes", "many_steps", "machine_runs", "traffic_steps"):
-            check_count(name, getattr(self, name), 1)
-        check_count("degree", self.degree, 2)
-        check_count("tree_nodes", self.tree_nodes, self.crossed_nodes)
-        check_seed("seed", self.seed)
+        check_fields(self, runs=8, degree=2, tree_nodes=self.crossed_nodes, intervals=1)
+        check_fields(self, steps=1, measured_steps=1, crossed_nodes=1, many_steps=1, machine_runs=1, traffic_steps=1)
         if not 2 <= self.machine_nodes <= len(machine.NODES):
             raise fail("machine_nodes", f"a number from 2 to {len(machine.NODES)}", self.machine_nodes)
         for d in self.intervals:
-            check_count("intervals", d, 1)
             if self.traffic_steps % d:
                 raise fail("traffic_steps", f"a multiple of {d}", self.traffic_steps)
 

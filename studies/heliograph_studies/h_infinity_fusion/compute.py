@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import heliograph as hg
+from heliograph_studies import Inline, Stages, Unlisted
 from heliograph_studies.h_infinity_fusion.discriminating import NODE, Discriminating, discriminate
 from heliograph_studies.h_infinity_fusion.example import (
     MORE_QUANTIZERS,
@@ -32,8 +33,6 @@ from heliograph_studies.h_infinity_fusion.levels import (
 )
 from heliograph_studies.h_infinity_fusion.setting import NODES, PAPER_WEIGHTS, STATES, Setting
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
 
 
 @dataclass(frozen=True)

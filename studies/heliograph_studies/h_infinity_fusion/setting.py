@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 import heliograph as hg
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
+from heliograph_studies import check_fields
 
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2")
@@ -67,10 +68,7 @@ class Setting:
     zoom: float = 0.1
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 100)  # with fewer a standard error means little
-        check_seed("seed", self.seed)
-        check_count("steps", self.steps, 8)
-        check_count("segments", self.segments, 2)
+        check_fields(self, runs=100, steps=8, segments=2)  # with fewer runs a standard error means little
         for name, low, high in (("growth", 0, np.inf), ("weight", 0, np.inf), ("initial", 0, np.inf), ("decay", 0, 1)):
             if not low < getattr(self, name) < high:
                 raise fail(name, f"a number between {low:g} and {high:g}", getattr(self, name))

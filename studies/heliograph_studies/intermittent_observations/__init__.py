@@ -4,11 +4,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, VERMILION
+from heliograph_studies import Statement, Study, stated
 from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
-from heliograph_studies.intermittent_observations import compute, statements
+from heliograph_studies.intermittent_observations import compute
 from heliograph_studies.intermittent_observations.compute import Outcome
 from heliograph_studies.intermittent_observations.setting import Setting as Setting
-from heliograph_studies.study import Study
+from heliograph_studies.intermittent_observations.setting import threshold
 
 BURST_COLOURS = (GREEN, BLUE, AMBER)
 
@@ -76,6 +77,24 @@ def words(outcome: Outcome) -> dict[str, object]:
     return {"rows": rows, "blue": BLUE, "vermilion": VERMILION, "green": GREEN}
 
 
+def statements(outcome: Outcome) -> dict[str, list[Statement]]:
+    """Theorems, special cases, successors, and what is often taken for granted, with the numbers that decide."""
+    setting = outcome.setting
+    eigenvalues = np.abs(np.linalg.eigvals(setting.coupled.transition))
+    increments = [np.diff(values) for values in (outcome.between, outcome.below, outcome.turning[::2])]
+    shrinking, growing, turned = (float(steps[-1] / steps[-2]) for steps in increments)
+    numbers = {
+        "predicted": threshold(setting.scalar.transition[0, 0]),
+        "product": 1 - float(np.prod(eigenvalues[eigenvalues > 1])) ** -2,
+        "between_patterns": outcome.between,
+        "shrinking": shrinking,
+        "growing": growing,
+        "turned": turned,
+        "expected": [threshold(factor) for factor in np.diag(setting.components.transition)],
+    }
+    return stated(__file__, {**vars(outcome), **numbers})
+
+
 publication = Study(
     name="intermittent-observations",
     setting=Setting,
@@ -84,7 +103,7 @@ publication = Study(
     figures=figures,
     words=words,
     publication="Kalman filtering with intermittent observations",
-    statements=statements.statements,
+    statements=statements,
     data=compute.write_record,
 )
 run = publication.run

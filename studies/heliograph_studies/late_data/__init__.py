@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies import Study
 from heliograph_studies.curves import Curve, Panel, curves_over_time, paths
 from heliograph_studies.demo.recording import plaza2
 from heliograph_studies.late_data import compute
@@ -12,7 +13,6 @@ from heliograph_studies.late_data.compute import Setting as Setting
 from heliograph_studies.late_data.moving import BEGIN
 from heliograph_studies.late_data.plaza import DRIVE
 from heliograph_studies.late_data.replay import WINDOW
-from heliograph_studies.study import Study
 
 ROWS = {  # method: how it is called, and its colour
     "used_as_current": ("taken as current", VERMILION),

@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.live.timeline import Timeline
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import fail
+from heliograph_studies import NO_FILE, File, Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.late_data import moving, plaza
 from heliograph_studies.late_data.packets import Packets, Statistics, read_trace, statistics, synthetic_packets
 from heliograph_studies.late_data.replay import METHODS, Estimated, every_method, squared_errors
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.settings import NO_FILE, File
-from heliograph_studies.stages import Stages
 
 
 @dataclass(frozen=True)
@@ -33,11 +31,10 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs)
+        check_fields(self, runs=1)
         for name in ("duration", "network_s"):
             if not 1.0 <= getattr(self, name) < float("inf"):
                 raise fail(name, "seconds, one or more", getattr(self, name))
-        check_seed("seed", self.seed)
         object.__setattr__(self, "trace", File(self.trace))  # of a path in any form
 
 

@@ -12,16 +12,13 @@ from matplotlib.figure import Figure
 import heliograph as hg
 from heliograph.learning.intervals import Method
 from heliograph.learning.likelihood.objective import Form
-from heliograph.numerics.check import check_count, check_seed
 from heliograph.report.figures import AMBER, BLUE, INK, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph_studies import Stages, Study, Unlisted, check_fields
 from heliograph_studies.demo import learned as recorded
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import networks, one_trial, relay
 from heliograph_studies.demo.recording import PlazaRecording, plaza2, read_recording
 from heliograph_studies.learning.recordings_apart import fit_each
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 
 MEAN, VARIANCE = 0.8, 0.16
 PLANT_NOISE, SENSOR_NOISE, HOP_NOISE, DIRECT_NOISE = 0.2, 0.3, 0.3, 0.2
@@ -54,9 +51,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("batches", "batch", "relays"):
-            check_count(name, getattr(self, name))
-        check_seed("seed", self.seed)
+        check_fields(self, batches=1, batch=1, relays=1)
 
 
 class Row(NamedTuple):

@@ -7,12 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.check import TINY
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies import Stages, Study, Unlisted, check_fields
 from heliograph_studies.curves import Curve, Panel, curves_over, curves_over_time
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 
 NOISE = 0.05
 POWER = 0.04 / (1 - 0.98**2)  # E x^2 of the plant, where it starts
@@ -40,14 +38,8 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("gains", "leaving", "arrival"):
-            for value in getattr(self, name):
-                scalar(name, value, *((0.0, 1.0) if name != "gains" else ()))
-        if min(self.leaving) <= 0:
-            raise fail("leaving", "probabilities above 0", self.leaving)
-        check_count("runs", self.runs, 8)  # a quarter of them where there is side information
-        check_count("particle_runs", self.particle_runs, 2)
-        check_seed("seed", self.seed)
+        # a quarter of the runs where there is side information
+        check_fields(self, gains=(), leaving=(TINY, 1.0), arrival=(0.0, 1.0), runs=8, particle_runs=2)
 
 
 def bursts(setting: Setting, correlation: float | None = None, name: str | None = None) -> hg.random_affine.Modes:

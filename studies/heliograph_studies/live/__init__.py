@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from heliograph.numerics.check import check_count, check_seed
+from heliograph_studies import Study, check_fields
 from heliograph_studies.demo.recording import plaza2
-from heliograph_studies.study import Study
 
 NEEDS = ("nats", "paho", "prometheus_client", "pydantic", "sqlalchemy", "starlette", "uvicorn")
 
@@ -21,9 +20,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("kills", self.kills)
-        check_count("messages", self.messages, 2000)
-        check_seed("seed", self.seed)
+        check_fields(self, kills=1, messages=2000)
 
 
 def _part(name: str) -> Callable[..., Any]:

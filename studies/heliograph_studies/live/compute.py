@@ -18,14 +18,13 @@ from heliograph.live.plant_codec import plant_from
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.curves import Curve, paths
 from heliograph_studies.live import Setting
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, Killed, killed, left_alone
 from heliograph_studies.live.mower import PLANT, Drive, network, read_drive
 from heliograph_studies.live.server import Server, find_server
 from heliograph_studies.live.speed import in_memory, many_plants, through
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
 
 Links = dict[str, Link]  # by node, what the store says that came from it
 

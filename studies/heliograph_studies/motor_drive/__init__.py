@@ -4,12 +4,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
+from heliograph_studies import Study
 from heliograph_studies.curves import Curve, Panel, consistency_over_time, curves_over_time, errors_with_bands
 from heliograph_studies.motor_drive import compute
 from heliograph_studies.motor_drive.compute import CASES, TRUSTS, Outcome
 from heliograph_studies.motor_drive.compute import Setting as Setting
 from heliograph_studies.motor_drive.machine import LOAD_STEP, LOAD_STEP_AT, RATED, STEP
-from heliograph_studies.study import Study
 
 ROWS = {  # filter: how it is called, and its colour
     "fused/zero_mean": ("both relays, zero-mean", BLUE),

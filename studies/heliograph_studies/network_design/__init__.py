@@ -6,13 +6,13 @@ from matplotlib.figure import Figure
 
 from heliograph.report.design_page import front_figure
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, STYLE, VERMILION, WIDTH
+from heliograph_studies import Study
 from heliograph_studies.demo.recording import plaza2
 from heliograph_studies.network_design import compute
 from heliograph_studies.network_design.compute import FADING, Case, Outcome, Schedules
 from heliograph_studies.network_design.setting import NAMES
 from heliograph_studies.network_design.setting import Setting as Setting
 from heliograph_studies.network_design.theory import relay_line
-from heliograph_studies.study import Study
 
 COLOURS = (BLUE, AMBER, GREEN)  # of total powers
 POINTS = 60  # values of the noise in the picture of sites

@@ -10,6 +10,7 @@ from scipy.optimize import brentq, minimize_scalar
 import heliograph as hg
 from heliograph.planning.comparisons import Front
 from heliograph.planning.paths.model import path_information
+from heliograph_studies import Inline, Stages
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import Design, designs, one_trial
 from heliograph_studies.demo.compute import networks as demo_networks
@@ -18,8 +19,6 @@ from heliograph_studies.network_design import setting, theory
 from heliograph_studies.network_design import setting as models
 from heliograph_studies.network_design.setting import Setting
 from heliograph_studies.network_design.theory import feedback_limit
-from heliograph_studies.outcome import Inline
-from heliograph_studies.stages import Stages
 
 PLANT = hg.LinearPlant([[1.1, 0.2], [0.2, 0.8]], np.eye(2), [0.0, 0.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 1.0]], 1.0)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, scalar
 from heliograph.planning.paths.model import Paths
+from heliograph_studies import check_fields
 
 TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 PROCESS = np.diag([0.1, 0.05, 0.2])
@@ -45,15 +45,9 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + check_count("seeds", self.seeds) - 1)
-        for name in ("one_hop", "two_hops", "front", "on", "chosen", "rho"):
-            for power in np.atleast_1d(getattr(self, name)):
-                scalar(name, power, np.finfo(float).tiny)
-        for period in self.periods:
-            check_count("periods", period)
-        for times in self.losses:
-            scalar("losses", times, 1.0)
-        scalar("exponent", self.exponent, 1.0)
+        power = (np.finfo(float).tiny,)
+        check_fields(self, one_hop=power, two_hops=power, front=power, on=power, chosen=power, rho=power)
+        check_fields(self, seeds=1, periods=1, losses=(1.0,), exponent=(1.0,))
 
 
 def gain(kappa: float, length: float) -> hg.Discrete:

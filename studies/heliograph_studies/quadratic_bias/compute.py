@@ -20,10 +20,9 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.random_affine.combine import known
 from heliograph.simulation import ErrorStatistics
-from heliograph_studies.outcome import Inline, Unlisted
+from heliograph_studies import Inline, Stages, Unlisted
 from heliograph_studies.quadratic_bias.bounds import Boundedness, boundedness
 from heliograph_studies.quadratic_bias.setting import Model, Setting
-from heliograph_studies.stages import Stages
 
 
 class Printed(NamedTuple):

@@ -10,12 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, scalar
 from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION
+from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields
 from heliograph_studies.curves import Curve, Panel, curves_over, paths
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 
 SPEED, TURN = 1.0, 0.02  # m and rad a step
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
@@ -40,13 +37,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 2)
-        check_count("fading_runs", self.fading_runs, 10)  # as many as there are classes of runs
-        check_count("steps", self.steps)
-        check_count("fading_steps", self.fading_steps)
-        scalar("bearing", self.bearing, 0.0)
-        scalar("arrival", self.arrival, 0.0, 1.0)
-        check_seed("seed", self.seed)
+        check_fields(self, runs=2, fading_runs=CLASSES, steps=1, fading_steps=1, bearing=(0.0,), arrival=(0.0, 1.0))
 
 
 def move(x: jax.Array, u: jax.Array) -> jax.Array:

@@ -10,12 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies import Stages, Study, Unlisted, check_fields
 from heliograph_studies.curves import Curve, Panel, curves_over_time, errors_with_bands
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 from heliograph_studies.successive_relays import setting as successive_relays
 
 STEPS = 100
@@ -32,8 +29,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 2)
-        check_seed("seed", self.seed)
+        check_fields(self, runs=2)
 
 
 def moving_point() -> tuple[hg.LinearPlant, hg.LinearSensor, hg.random_affine.AbstractRandomAffine]:

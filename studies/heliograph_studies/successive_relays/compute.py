@@ -11,8 +11,7 @@ from heliograph.files.recording import write_estimates
 from heliograph.numerics.check import fail
 from heliograph.relays import RelayDesign
 from heliograph.relays.design import GainsByFilter
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.successive_relays.certificate import RelayCertificate, certify_relays
 from heliograph_studies.successive_relays.setting import QUIET_START, Setting, shadowing
 

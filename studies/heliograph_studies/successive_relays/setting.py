@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import expm
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed
+from heliograph_studies import check_fields
 
 TRANSITION = np.array([[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]])  # as printed
 INITIAL_COVARIANCE = np.diag([0.05, 0.02, 0.03])
@@ -59,12 +59,8 @@ class Setting:
     initial_covariance: np.ndarray = field(default_factory=lambda: INITIAL_COVARIANCE)
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 100)  # standard errors come from batches of runs
-        check_seed("seed", self.seed)
-        check_count("horizon", self.horizon, 100)  # the statements speak of k = 10, 50 and 100
-        check_count("sweeps", self.sweeps)
-        check_count("steady", self.steady, 100)
-        self.plant(), self.sensor(), self.network()  # their own checks
+        # standard errors come from batches of runs; the statements speak of k = 10, 50 and 100
+        check_fields(self, runs=100, horizon=100, sweeps=1, steady=100)
 
     @property
     def process_covariance(self) -> np.ndarray:

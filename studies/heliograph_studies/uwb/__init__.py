@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION
+from heliograph_studies import Study
 from heliograph_studies.curves import Curve, Panel, curves_over_time, paths
-from heliograph_studies.study import Study
 from heliograph_studies.uwb import compute
 from heliograph_studies.uwb.compute import OfDrive, Outcome, best_of
 from heliograph_studies.uwb.setting import BEST, BIAS, BIASED

@@ -9,8 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters.innovation import InnovationSummary, Weighed, outlying, summarise_innovations
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.uwb.drives import Drive, drives
 from heliograph_studies.uwb.learning import followed, learn, padded, slots, true_places
 from heliograph_studies.uwb.setting import BEST, HEIGHT, STARTS, Numbers, Setting

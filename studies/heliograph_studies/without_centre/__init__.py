@@ -9,13 +9,10 @@ from matplotlib.figure import Figure
 
 import heliograph as hg
 from heliograph.fusion import DiffusionWeights, MatrixWeights, TraceIntersection
-from heliograph.numerics.check import check_count, check_seed, scalar
 from heliograph.report.figures import BLUE, GREEN, INK, VERMILION
 from heliograph.simulation import best_possible, mesh_arrivals, mesh_errors
+from heliograph_studies import Stages, Study, Unlisted, check_fields
 from heliograph_studies.curves import Curve, Panel, curves_over_time, graph_map
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
-from heliograph_studies.study import Study
 
 FILTER = "alone"  # of a node that receives nobody
 MOTION = 0.98 * np.kron(np.eye(2), [[1.0, 1.0], [0.0, 0.97]])  # position and speed along two axes
@@ -40,12 +37,7 @@ class Setting:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        check_count("nodes", self.nodes, 4)
-        check_count("steps", self.steps, 4)
-        check_count("runs", self.runs, 2)
-        check_seed("seed", self.seed)
-        scalar("radius", self.radius, 0.01)
-        scalar("loss", self.loss, 0.0, 0.9)
+        check_fields(self, nodes=4, steps=4, runs=2, radius=(0.01,), loss=(0.0, 0.9))
 
 
 def positions(setting: Setting) -> dict[str, np.ndarray]:

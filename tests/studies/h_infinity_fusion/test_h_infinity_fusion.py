@@ -19,11 +19,11 @@ from heliograph_studies.h_infinity_fusion import (
     growth,
     indices,
     levels,
+    statements,
     worst_disturbance,
 )
 from heliograph_studies.h_infinity_fusion.compute import Parts
 from heliograph_studies.h_infinity_fusion.setting import NODES, Setting, dynamics
-from heliograph_studies.h_infinity_fusion.statements import statements
 from tests.studies.h_infinity_fusion.verdicts import VERDICTS
 from tests.studies.readme import said_of
 from tests.studies.verdicts import check_verdicts

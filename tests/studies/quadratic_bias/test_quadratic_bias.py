@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from heliograph_studies import quadratic_bias
-from heliograph_studies.quadratic_bias import compute, setting
-from heliograph_studies.quadratic_bias.statements import statements
+from heliograph_studies.quadratic_bias import compute, setting, statements
 from heliograph_studies.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
 from tests.studies.readme import README, said_of
