@@ -12,7 +12,6 @@ from heliograph_studies.cubature_fusion.compute import Outcome, Runs
 from heliograph_studies.cubature_fusion.setting import (
     B4,
     B6,
-    FIXED_ZERO_MEAN_SCALAR,
     K1,
     NODES,
     STATES,
@@ -20,6 +19,7 @@ from heliograph_studies.cubature_fusion.setting import (
     Scenario,
     plant,
 )
+from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR as FIXED_ZERO_MEAN_SCALAR
 from heliograph_studies.cubature_fusion.setting import Setting as Setting
 from heliograph_studies.curves import Curve, Panel, curves_over_time, label_right
 
@@ -143,14 +143,8 @@ def words(outcome: Outcome) -> dict[str, object]:
     return {
         "label": label,
         "named": {name: NAMES.get(name, name.replace("_", " ")) for o in outcome.both for name in _names(o)},
-        "colours": COLOURS,
         "rmse": {name: strong.pooled(name).rmse() for name in (*BETTER, METHOD, "mean_gain")},
-        "method": METHOD,
-        "better": BETTER,
         "tables": {"strong scenario": _table(strong), "printed example": _table(outcome.printed)},
-        "nodes": NODES,
-        "states": STATES,
-        "zero_mean_scalar": FIXED_ZERO_MEAN_SCALAR,
     }
 
 

@@ -277,10 +277,5 @@ def pair(score: Deviation, colour: str, name: str) -> list[Curve]:
     ]
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How filters and situations are called."""
-    return {"late": LATE, "filters": CLOCKS, "situations": SITUATIONS}
-
-
-example = Study("delays", Setting, compute, 4, figures, words)
+example = Study("delays", Setting, compute, 4, figures)
 run = example.run

@@ -10,7 +10,8 @@ from heliograph_studies.demo import compute, robot
 from heliograph_studies.demo.compute import NAMES, Outcome
 from heliograph_studies.demo.compute import Setting as Setting
 from heliograph_studies.demo.learned import position_nees
-from heliograph_studies.demo.recording import CALIBRATED, WINDOW
+from heliograph_studies.demo.recording import CALIBRATED as CALIBRATED
+from heliograph_studies.demo.recording import WINDOW as WINDOW
 
 COLOURS = dict(zip(NAMES, (BLUE, PURPLE, VERMILION, GREEN, MUTED), strict=True))
 LABELS = {name: name.replace("_", " ").replace("relay aware", "relay-aware") for name in NAMES}
@@ -38,19 +39,8 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
 
 
 def words(outcome: Outcome) -> dict[str, object]:
-    """Labels and colours, and what of the drive the page tells."""
-    drive = outcome.drive
-    return {
-        "labels": LABELS,
-        "colours": COLOURS,
-        "averaged": AVERAGED,
-        "window": WINDOW,
-        "seconds": AVERAGED * np.mean(drive.odometry[:, 2]),
-        "in_sample": drive.name == CALIBRATED,
-        "distance": drive.odometry[:, 0].sum(),
-        "ranges": np.count_nonzero(~np.isnan(drive.ranges)),
-        "constants": robot.Constants(robot.DRIVES[drive.name].gyro_rate)._asdict(),
-    }
+    """The constants of the drive's model by name."""
+    return {"constants": robot.Constants(robot.DRIVES[outcome.drive.name].gyro_rate)._asdict()}
 
 
 example = Study(

@@ -236,14 +236,5 @@ def _messages(outcome: Outcome) -> Figure:
     return figure
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How the recipes are called, and how much worse they are."""
-    best = outcome.scores["sum"]
-    return {
-        "labels": ROWS,
-        "worse": {name: 100 * (score.error / best.error - 1) for name, score in outcome.scores.items()},
-    }
-
-
-example = Study("event-triggered", Setting, compute, 2, figures, words)
+example = Study("event-triggered", Setting, compute, 2, figures)
 run = example.run

@@ -116,13 +116,5 @@ def traffic_picture(outcome: Outcome) -> Figure:
     return figure
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """Labels and colours."""
-    machine = {rule: LABELS.get(rule, "equal intersection") for rule in outcome.strong["claimed"]}
-    colours = {"vermilion": VERMILION, "blue": BLUE, "purple": PURPLE}
-    return {"labels": {**LABELS, "root": "root of the tree"}, "networks": NETWORKS, "kinds": KINDS, "machine": machine,
-            **colours}  # fmt: skip
-
-
-example = Study("fusion", Setting, compute.compute, len(compute.CASES) + 5, figures, words)
+example = Study("fusion", Setting, compute.compute, len(compute.CASES) + 5, figures)
 run = example.run

@@ -70,13 +70,6 @@ def _rounding(outcome: Outcome) -> Figure:
     return curves_over(steps, Panel("skew part of V, and tr V", curves), "step")
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """The rows of the table: each plant and link."""
-    rows = {"scalar": outcome.scalar, "two states": outcome.coupled, "three states, one unstable": outcome.one_unstable}
-    rows |= {f"scalar, fail {link.fail:g}, recover {link.recover:g}": link for link in outcome.bursts}
-    return {"rows": rows, "blue": BLUE, "vermilion": VERMILION, "green": GREEN}
-
-
 def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """Theorems, special cases, successors, and what is often taken for granted, with the numbers that decide."""
     setting = outcome.setting
@@ -101,7 +94,6 @@ publication = Study(
     compute=compute.compute,
     stages=3,
     figures=figures,
-    words=words,
     publication="Kalman filtering with intermittent observations",
     statements=statements,
     data=compute.write_record,

@@ -10,9 +10,9 @@ from heliograph_studies.demo.recording import plaza2
 from heliograph_studies.late_data import compute
 from heliograph_studies.late_data.compute import Outcome, Through
 from heliograph_studies.late_data.compute import Setting as Setting
-from heliograph_studies.late_data.moving import BEGIN
+from heliograph_studies.late_data.moving import BEGIN as BEGIN
 from heliograph_studies.late_data.plaza import DRIVE
-from heliograph_studies.late_data.replay import WINDOW
+from heliograph_studies.late_data.replay import WINDOW as WINDOW
 
 ROWS = {  # method: how it is called, and its colour
     "used_as_current": ("taken as current", VERMILION),
@@ -51,15 +51,5 @@ def errors_over_time(through: Through, stretch: slice) -> Figure:
     return curves_over_time(through.time[stretch], [Panel("position error (m)", curves)], "time (s)")
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How the methods are called, what became of the packets, and where those of the point begin."""
-
-    def verdicts(through: Through) -> str:
-        return ", ".join(f"{count:,} {verdict}" for verdict, count in through.counts.items() if count)
-
-    both = {"point": verdicts(outcome.point), "mower": verdicts(outcome.plaza.through)}
-    return {"methods": ROWS, "begin": BEGIN, "window": WINDOW, "verdicts": both}
-
-
-example = Study("late-data", Setting, compute.compute, 3, figures, words, files=plaza2)
+example = Study("late-data", Setting, compute.compute, 3, figures, files=plaza2)
 run = example.run

@@ -290,9 +290,6 @@ def words(outcome: Outcome) -> dict[str, object]:
     cosines = [value for row in rows.values() for value in row.covered["cosines"].values()]
     return {
         "rows": rows,
-        "parameters": PARAMETERS,
-        "vermilion": VERMILION,
-        "blue": BLUE,
         "worst": min(cosines),
         "best": max(cosines),
         "counted": ", ".join(map(str, sorted({row.recordings for row in rows.values()}))),

@@ -256,10 +256,5 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     }
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How the filters are called, and those that are shown first."""
-    return {"rows": ROWS, "first": CLAIMING}
-
-
-example = Study("links-with-memory", Setting, compute, 6, figures, words)
+example = Study("links-with-memory", Setting, compute, 6, figures)
 run = example.run

@@ -9,7 +9,10 @@ from heliograph_studies.curves import Curve, Panel, consistency_over_time, curve
 from heliograph_studies.motor_drive import compute
 from heliograph_studies.motor_drive.compute import CASES, TRUSTS, Outcome
 from heliograph_studies.motor_drive.compute import Setting as Setting
-from heliograph_studies.motor_drive.machine import LOAD_STEP, LOAD_STEP_AT, RATED, STEP
+from heliograph_studies.motor_drive.machine import LOAD_STEP as LOAD_STEP
+from heliograph_studies.motor_drive.machine import LOAD_STEP_AT as LOAD_STEP_AT
+from heliograph_studies.motor_drive.machine import RATED
+from heliograph_studies.motor_drive.machine import STEP as STEP
 
 ROWS = {  # filter: how it is called, and its colour
     "fused/zero_mean": ("both relays, zero-mean", BLUE),
@@ -61,17 +64,5 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     }
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """Labels and colours, and constants of the drive."""
-    return {
-        "filters": ROWS,
-        "labels": CASE_LABELS,
-        "averaged": AVERAGED,
-        "load_step": LOAD_STEP,
-        "load_step_at": LOAD_STEP_AT,
-        "step_ms": STEP * 1e3,
-    }
-
-
-example = Study("motor-drive", Setting, compute.compute, 3, figures, words, needs=["gym_electric_motor"])
+example = Study("motor-drive", Setting, compute.compute, 3, figures, needs=["gym_electric_motor"])
 run = example.run

@@ -9,7 +9,8 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, INK, STYLE, VERMILION,
 from heliograph_studies import Study
 from heliograph_studies.demo.recording import plaza2
 from heliograph_studies.network_design import compute
-from heliograph_studies.network_design.compute import FADING, Case, Outcome, Schedules
+from heliograph_studies.network_design.compute import FADING as FADING
+from heliograph_studies.network_design.compute import Case, Outcome, Schedules
 from heliograph_studies.network_design.setting import NAMES
 from heliograph_studies.network_design.setting import Setting as Setting
 from heliograph_studies.network_design.theory import relay_line
@@ -87,12 +88,5 @@ def _designs(outcome: Outcome) -> dict[str, dict[float, Case]]:
     return {"one hop": outcome.one_hop, "two hops": outcome.two_hops}
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """Colours, the designs by their hops, and the order of the schedule."""
-    order = " ".join(NAMES[i] for step in outcome.schedules.turns.steps for i in step)
-    colours = {"blue": BLUE, "green": GREEN, "vermilion": VERMILION}
-    return {"designs": _designs(outcome), "order": order, "fading": FADING, **colours}
-
-
-example = Study("network-design", Setting, compute.compute, 7, figures, words, files=plaza2)
+example = Study("network-design", Setting, compute.compute, 7, figures, files=plaza2)
 run = example.run

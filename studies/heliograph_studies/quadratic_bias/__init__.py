@@ -52,23 +52,20 @@ def _over_time(label: str, values: Mapping[str, np.ndarray], names: Sequence[str
     return curves_over_time(np.arange(begin, begin + len(values[names[0]])), [Panel(label, curves)], "t")
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """Labels and colours by filter, in the order of the tables."""
-    return {"colours": COLOURS, "labels": LABELS, "claimed": CLAIMED, "printed": TRUE}
-
-
 def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """All statements that the example and the scenario speak to, with the numbers that decide."""
     variance, beyond = outcome.example.covariance, outcome.outage.monte_carlo[TRUE]["minus_linear"]
     states = outcome.example.model.states[:2]
     found = [[getattr(Noises(), name).law().moment((k,)) for k in (2, 3, 4)] for name in TABLE_1]
     numbers = {
+        "printed": TRUE,
+        "claimed": CLAIMED,
         "worst": min(100 * (1 - variance[TRUE][s][1:] / variance["linear"][s][1:]).min() for s in states),
         "excess": Sampled(beyond["x"], beyond["x_se"]),
         "largest_gap": np.abs(np.array(found) - list(TABLE_1.values())).max(),
         "refused": [name for name, moments in TABLE_1.items() if not _of_some_law(moments)],
     }
-    return stated(__file__, {**vars(outcome), **words(outcome), **numbers})
+    return stated(__file__, {**vars(outcome), **numbers})
 
 
 def _of_some_law(moments: Sequence[float]) -> bool:
@@ -85,7 +82,6 @@ publication = Study(
     compute=compute.compute,
     stages=3,
     figures=figures,
-    words=words,
     publication="Quadratic filtering with dynamical bias under amplify-and-forward relays",
     statements=statements,
     data=compute.write_record,

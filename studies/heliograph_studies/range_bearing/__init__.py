@@ -280,12 +280,5 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     }
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How filters and rules are called, the finest rule, and the colours of angles and of plain numbers."""
-    labels = {name: label for name, label in LABELS.items() if name in outcome.across}
-    finest = list(outcome.fading.values())[-1].score
-    return {"labels": labels, "rules": RULES, "finest": finest, "blue": BLUE, "vermilion": VERMILION}
-
-
-example = Study("range-bearing", Setting, compute, 4, figures, words)
+example = Study("range-bearing", Setting, compute, 4, figures)
 run = example.run

@@ -217,10 +217,5 @@ def _deviation(covariance: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(places(covariance)))
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """Colours, and the step at which deviations are compared."""
-    return {"muted": MUTED, "blue": BLUE, "step": LAG_STEP, "count": len(outcome.filtered)}
-
-
-example = Study("smoothing", Setting, compute, 4, figures, words)
+example = Study("smoothing", Setting, compute, 4, figures)
 run = example.run

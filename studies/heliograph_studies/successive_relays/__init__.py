@@ -89,8 +89,6 @@ def words(outcome: Outcome) -> dict[str, object]:
     names = {"the paper's gains": designs.paper, "chosen for the receiver": designs.tuned,
              "the same, at the paper's power": designs.bounded}  # fmt: skip
     return {
-        "colours": {"green": GREEN, "purple": PURPLE, "blue": BLUE},
-        "titles": TITLES,
         "free": designs.mean_ratio(designs.tuned),
         "same": designs.mean_ratio(designs.bounded),
         "total": total,

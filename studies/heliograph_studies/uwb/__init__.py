@@ -62,19 +62,9 @@ def _weights(drive: OfDrive) -> Panel:
 
 
 def words(outcome: Outcome) -> dict[str, object]:
-    """Names of the rules and colours, and which rule the page is about."""
-    every = list(outcome.drives.values())
-    known = [(d, best_of(d).rmse / d.published.ls) for d in every if d.published.ls]
-    return {
-        "names": NAMES,
-        "best": BEST,
-        "blue": BLUE,
-        "muted": MUTED,
-        "better": sum(ratio < 1 for _, ratio in known),
-        "known": len(known),
-        "ratio": float(np.mean([ratio for _, ratio in known])) if known else None,
-        "text": lambda value: "–" if value is None else f"{value:.3f}",
-    }
+    """Errors over those of published least squares, where there are any."""
+    known = [drive for drive in outcome.drives.values() if drive.published.ls]
+    return {"ratios": [drive.rules[BEST].rmse / (drive.published.ls or 1) for drive in known]}
 
 
 def files(setting: Setting) -> list[Path]:

@@ -176,10 +176,5 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     }
 
 
-def words(outcome: Outcome) -> dict[str, object]:
-    """How rules are called."""
-    return {"names": NAMES}
-
-
-example = Study("without-centre", Setting, compute, 3, figures, words)
+example = Study("without-centre", Setting, compute, 3, figures)
 run = example.run

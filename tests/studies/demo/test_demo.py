@@ -155,7 +155,7 @@ def test_constants_of_one_drive_serve_another(outcome: Outcome, learned: Learned
     assert (other.recording, other.rows, outcome.recording) == ("Plaza1", 9660, "Plaza2")
     text = filled(
         Path(demo.__file__).with_name("page.md"),
-        {"setting": demo.Setting("plaza1"), **vars(other), **demo.example.words(other)},
+        demo.example.numbers(demo.Setting("plaza1"), other),
     )
     assert "The constants come from another drive" in text and "in-sample" not in text
     assert "--recording plaza1" in text and "demo.robot:plaza1" in text
