@@ -10,8 +10,8 @@ from heliograph_studies.demo import compute, robot
 from heliograph_studies.demo.compute import NAMES, Outcome
 from heliograph_studies.demo.compute import Setting as Setting
 from heliograph_studies.demo.learned import position_nees
-from heliograph_studies.demo.recording import CALIBRATED as CALIBRATED
-from heliograph_studies.demo.recording import WINDOW as WINDOW
+from heliograph_studies.demo.robot import CALIBRATED as CALIBRATED
+from heliograph_studies.demo.robot import WINDOW as WINDOW
 
 COLOURS = dict(zip(NAMES, (BLUE, PURPLE, VERMILION, GREEN, MUTED), strict=True))
 LABELS = {name: name.replace("_", " ").replace("relay aware", "relay-aware") for name in NAMES}

@@ -1,8 +1,9 @@
 """All numbers of the reproduction, in order."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,8 @@ from heliograph_studies.h_infinity_fusion.levels import (
 )
 from heliograph_studies.h_infinity_fusion.setting import NODES, PAPER_WEIGHTS, STATES, Setting
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst
+
+GAP = ("mean", "se", "share_of_runs_better")  # of a difference of fused errors
 
 
 @dataclass(frozen=True)
@@ -79,21 +82,25 @@ class Parts:
         return float(uplink.saturated[:, first:].mean())
 
 
-if TYPE_CHECKING:
-    import xarray
-
-
 def numbers(result: Parts) -> dict[str, Any]:
-    """All numbers."""
-    outcome = result.runs
-    decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
+    """What the summary lists."""
+    runs, growth, true, levels = result.runs, result.growth, result.true_growth, result.setting.levels
+    decodable = runs.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
+    gaps = {other: result.difference("dynamic", other) for other in ("static", "static_p41")}
     return {
-        "nodes": [
-            node_numbers(node, level, result) for node, level in zip(result.nodes, result.setting.levels, strict=True)
-        ],
-        "fusion": fusion_numbers(result),
+        "nodes": [_node(node, level, result) for node, level in zip(result.nodes, levels, strict=True)],
+        "fusion": {
+            "weights": hg.fusion.level_weights(levels),
+            "gamma": result.fused_level,
+            "gamma_of_paper_weights": result.level_of_paper_weights(),
+            "gamma_of_paper_weights_as_printed": result.level_of_paper_weights(normalised=False),
+            "minkowski": {"gamma": result.minkowski, "best_node": min(levels)},
+        },
         "mean_fused_error_is": "mean over runs and s = 0 ... 15 of the norm of x - fused, of one-step predictions",
-        "mean_fused_error": error_numbers(result),
+        "mean_fused_error": {
+            **_errors(runs, RECURSIVE, (*QUANTIZERS, *MORE_QUANTIZERS)),
+            **{f"dynamic_minus_{other}": dict(zip(GAP, gap, strict=True)) for other, gap in gaps.items()},
+        },
         "saturated_fraction": result.saturated("dynamic"),
         "saturation": {
             "dynamic": result.saturated("dynamic"),
@@ -103,23 +110,26 @@ def numbers(result: Parts) -> dict[str, Any]:
             "largest_excess_over_13": result.replayed.excess,
         },
         "contexts": {
-            **{name: context(outcome, name) for name in outcome.filters if name != RECURSIVE},
-            "ekf_known": {**context(result.known, "ekf_known"), "note": "a second network, other draws"},
+            **{name: _context(runs, name) for name in runs.filters if name != RECURSIVE},
+            "ekf_known": {**_context(result.known, "ekf_known"), "note": "a second network, other draws"},
         },
-        "growth": growth_numbers(result),
-        "index": {
-            "J1": result.indices.local, "J2": result.indices.fused,
+        "growth": {
+            "visited": [_finding(f) for f in growth.visited], "whole_range": _finding(growth.whole),
+            "size": _finding(growth.size), "secant": growth.secant, "certified": true.certified,
+            "levels": {"one": true.constant, "differences": true.differences, "each_step": true.each_step},
+            "levels_are": "by node; one multiplier for f and f~, then separate ones",
+            "larger_growth": result.readings.larger_growth,
         },
-        "broken_guarantee": {
-            "node": NODES[0], "guaranteed": result.nodes[0].horizon.level, **worst_level(result.broken)
-        },
-        "discriminating": second_numbers(result.discriminating),
+        "index": {"J1": result.indices.local, "J2": result.indices.fused},
+        "broken_guarantee": {"node": NODES[0], "guaranteed": result.nodes[0].horizon.level, **_worst(result.broken)},
+        "discriminating": _second(result.discriminating),
     }  # fmt: skip
 
 
-def node_numbers(node: NodeDesigns, level: float, result: Parts) -> dict[str, Any]:
-    """Levels of a node, and the certificate of the recursive design at the paper's level."""
-    smallest = {f"recursive_{name}": value for name, value in node.smallest.items()}
+def _node(node: NodeDesigns, level: float, result: Parts) -> dict[str, Any]:
+    """Levels of a node, and the certificate of the recursive design at the paper's level; states are (x, e)."""
+    smallest, design = {f"recursive_{name}": value for name, value in node.smallest.items()}, node.paper
+    steps = zip(design.weights, design.gains, design.weights[1:], design.multipliers, strict=False)
     return {
         "gamma_paper": level,
         "steps_certified": node.certificate.steps_certified,
@@ -128,85 +138,32 @@ def node_numbers(node: NodeDesigns, level: float, result: Parts) -> dict[str, An
         "gamma_min_fixed_start": result.readings.fixed_start,
         "gamma_without_measurements": node.without_measurements,
         "failed_step_without_objective": node.failed["none"],
-        "certificate": certificate(node),
+        "certificate": [
+            {"P": p, "K": k, "L_next": np.linalg.inv(after), "lambda1": x, "lambda2": y, "gamma": design.level}
+            for p, k, after, (x, y) in steps
+        ],
     }
 
 
-def certificate(node: NodeDesigns) -> list[dict[str, Any]]:
-    """Everything that Theorem 1 needs at each step; states in the order (x, e)."""
-    design = node.paper
-    return [
-        {
-            "P": design.weights[s],
-            "K": design.gains[s],
-            "L_next": np.linalg.inv(design.weights[s + 1]),
-            "lambda1": float(design.multipliers[s, 0]),
-            "lambda2": float(design.multipliers[s, 1]),
-            "gamma": design.level,
-        }
-        for s in range(len(design.gains))
-    ]
+def _errors(runs: Runs, name: str, quantizers: Sequence[str]) -> dict[str, float]:
+    """Mean fused errors of a filter by quantizer, each with its standard error."""
+    means = {q: runs.mean_error(name, q) for q in quantizers}
+    return {f"{q}{end}": value for q, pair in means.items() for end, value in zip(("", "_se"), pair, strict=True)}
 
 
-def fusion_numbers(result: Parts) -> dict[str, Any]:
-    """Weights and levels of the fused estimate."""
-    return {
-        "weights": hg.fusion.level_weights(result.setting.levels),
-        "gamma": result.fused_level,
-        "gamma_of_paper_weights": result.level_of_paper_weights(),
-        "gamma_of_paper_weights_as_printed": result.level_of_paper_weights(normalised=False),
-        "minkowski": {"gamma": result.minkowski, "best_node": min(result.setting.levels)},
-    }
+def _context(runs: Runs, name: str) -> dict[str, Any]:
+    return {key.replace("none", "mean_fused_error"): value for key, value in _errors(runs, name, QUANTIZERS).items()}
 
 
-def error_numbers(result: Parts) -> dict[str, Any]:
-    """Mean fused errors of the paper's filters by quantizer, and their differences on the same runs."""
-    numbers: dict[str, Any] = {}
-    for name in (*QUANTIZERS, *MORE_QUANTIZERS):
-        numbers[name], numbers[f"{name}_se"] = result.runs.mean_error(RECURSIVE, name)
-    for other in ("static", "static_p41"):
-        mean, error, better = result.difference("dynamic", other)
-        numbers[f"dynamic_minus_{other}"] = {"mean": mean, "se": error, "share_of_runs_better": better}
-    return numbers
-
-
-def context(outcome: Runs, name: str) -> dict[str, Any]:
-    """Mean fused errors of another filter."""
-    (mean, error), dynamic, static = (outcome.mean_error(name, q) for q in QUANTIZERS)
-    return {
-        "mean_fused_error": mean,
-        "mean_fused_error_se": error,
-        "dynamic": dynamic[0], "dynamic_se": dynamic[1],
-        "static": static[0], "static_se": static[1],
-    }  # fmt: skip
-
-
-def growth_numbers(result: Parts) -> dict[str, Any]:
-    """What was found about a = 0.7, and levels with constants that were not refuted."""
-    constants, true = result.growth, result.true_growth
-    return {
-        "visited": [finding_numbers(f) for f in constants.visited],
-        "whole_range": finding_numbers(constants.whole),
-        "size": finding_numbers(constants.size),
-        "secant": constants.secant,
-        "levels": {"one": true.constant, "differences": true.differences, "each_step": true.each_step},
-        "levels_are": "by node; one multiplier for f and f~, then separate ones",
-        "certified": true.certified,
-        "larger_growth": result.readings.larger_growth,
-    }
-
-
-def finding_numbers(finding: hg.h_infinity.GrowthFinding) -> dict[str, Any]:
-    """A finding as numbers."""
+def _finding(finding: hg.h_infinity.GrowthFinding) -> dict[str, Any]:
     return {**finding._asdict(), "refuted": bool(finding.refuted)}
 
 
-def worst_level(worst: Worst) -> dict[str, float]:
-    """A level found by search."""
+def _worst(worst: Worst) -> dict[str, float]:
     return {"found": worst.level, "found_se": worst.standard_error}
 
 
-def second_numbers(second: Discriminating) -> dict[str, Any]:
+def _second(second: Discriminating) -> dict[str, Any]:
     """The second example: by filter, levels of each node and errors; by node, certificates."""
     return {
         "runs": second.runs,
@@ -214,38 +171,11 @@ def second_numbers(second: Discriminating) -> dict[str, Any]:
         "certified": {n: c.certified for n, c in second.certificates.items()},
         "without_structure": second.without_structure,
         "without_structure_or_gain": {NODE: second.without_structure_or_gain},
-        "growth": finding_numbers(second.finding),
-        "worst": {"node": NODE, **{name: worst_level(worst) for name, worst in second.worst.items()}},
+        "growth": _finding(second.finding),
+        "worst": {"node": NODE, **{name: _worst(worst) for name, worst in second.worst.items()}},
         "mean_fused_error": second.errors,
         f"mean_error_of_node_{NODE}": second.local_errors,
     }
-
-
-def record(result: Parts) -> "xarray.Dataset":
-    """Truth, one run, means over the runs and the gains as NetCDF."""
-    import xarray
-
-    outcome, second = result.runs, result.discriminating
-    quantizers = [*QUANTIZERS, *MORE_QUANTIZERS]
-    errors = {q: outcome.errors(RECURSIVE, q) for q in quantizers}
-    filters = list(second.over_time["white"])
-    data = {
-        "truth": (("s", "state"), outcome.truth),
-        "estimate": (("node", "s", "state"), outcome.estimates(RECURSIVE)[0]),
-        "mean_fused_error": (("quantizer", "s"), np.array([errors[q].mean(axis=0) for q in quantizers])),
-        "fused_error_of_run_0": (("quantizer", "s"), np.array([errors[q][0] for q in quantizers])),
-        "gain": (("node", "s", "state", "received"), np.array([n.paper.gains for n in result.nodes])),
-        "mean_amplitude": (("node", "s", "state"), result.replayed.amplitude.mean(axis=0)),
-        "second_mean_fused_error": (
-            ("scenario", "filter", "step"),
-            np.array([[item[name] for name in filters] for item in second.over_time.values()]),
-        ),
-    }
-    coordinates = {"s": np.arange(result.setting.steps), "state": list(STATES), "node": list(NODES),
-                   "quantizer": quantizers, "received": ["relay", "direct"], "scenario": list(second.over_time),
-                   "filter": filters}  # fmt: skip
-    about = {"seed": result.setting.seed, "runs": outcome.runs}
-    return xarray.Dataset(data, coordinates, about)
 
 
 @dataclass(frozen=True)
@@ -258,7 +188,9 @@ class Outcome:
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Design, simulate, search and judge."""
-    nodes, more, gap = stages("designs", lambda: designs(setting))
+    every = range(len(NODES))
+    nodes = stages("designs", lambda: [node_designs(setting, i) for i in every])
+    more, gap = stages("readings", lambda: (readings(setting), max(enumeration_gap(setting, i) for i in every)))
     broken = stages("worst disturbance of the example", lambda: violation(setting, 0, nodes[0].horizon))
     by_name = {
         RECURSIVE: [node.paper for node in nodes],
@@ -268,7 +200,8 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
     runs, known = stages(
         f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_known(setting))
     )
-    constants, true = stages("growth constants", lambda: _growth(runs))
+    constants = stages("growth constants", lambda: growth(runs))
+    true = stages("levels that they allow", lambda: true_growth(setting, constants.visited))
     second = stages("second example", lambda: discriminate(setting.runs, setting.seed))
     replayed = replay(runs)
     judged = stages("indices", lambda: indices(runs, replayed))
@@ -276,17 +209,28 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
     return Outcome(numbers(parts), parts)
 
 
-def designs(setting: Setting) -> tuple[list[NodeDesigns], Readings, float]:
-    """Of each node, of other readings, and how far Theorem 1 is from an enumeration."""
-    nodes = [node_designs(setting, i) for i in range(len(NODES))]
-    return nodes, readings(setting), max(enumeration_gap(setting, i) for i in range(len(NODES)))
-
-
-def _growth(runs: Runs) -> tuple[Growth, TrueGrowth]:
-    findings = growth(runs)
-    return findings, true_growth(runs.setting, findings.visited)
-
-
 def write_record(outcome: Outcome, folder: Path) -> None:
     """Truth, one run, means over the runs and the gains as NetCDF."""
-    record(outcome.parts).to_netcdf(folder / "record.nc", engine="h5netcdf")
+    import xarray
+
+    result, runs, second = outcome.parts, outcome.parts.runs, outcome.parts.discriminating
+    quantizers = [*QUANTIZERS, *MORE_QUANTIZERS]
+    errors = {q: runs.errors(RECURSIVE, q) for q in quantizers}
+    filters = list(second.over_time["white"])
+    data = {
+        "truth": (("s", "state"), runs.truth),
+        "estimate": (("node", "s", "state"), runs.estimates(RECURSIVE)[0]),
+        "mean_fused_error": (("quantizer", "s"), np.array([errors[q].mean(axis=0) for q in quantizers])),
+        "fused_error_of_run_0": (("quantizer", "s"), np.array([errors[q][0] for q in quantizers])),
+        "gain": (("node", "s", "state", "received"), np.array([n.paper.gains for n in result.nodes])),
+        "mean_amplitude": (("node", "s", "state"), result.replayed.amplitude.mean(axis=0)),
+        "second_mean_fused_error": (
+            ("scenario", "filter", "step"),
+            np.array([[item[name] for name in filters] for item in second.over_time.values()]),
+        ),
+    }
+    coordinates = {"s": np.arange(result.setting.steps), "state": list(STATES), "node": list(NODES),
+                   "quantizer": quantizers, "received": ["relay", "direct"], "scenario": list(second.over_time),
+                   "filter": filters}  # fmt: skip
+    about = {"seed": result.setting.seed, "runs": runs.runs}
+    xarray.Dataset(data, coordinates, about).to_netcdf(folder / "record.nc", engine="h5netcdf")

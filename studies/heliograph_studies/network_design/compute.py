@@ -15,10 +15,11 @@ from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import Design, designs, one_trial
 from heliograph_studies.demo.compute import networks as demo_networks
 from heliograph_studies.demo.recording import read_recording
-from heliograph_studies.network_design import setting, theory
 from heliograph_studies.network_design import setting as models
+from heliograph_studies.network_design import theory
 from heliograph_studies.network_design.setting import Setting
 from heliograph_studies.network_design.theory import feedback_limit
+from heliograph_studies.successive_relays import setting as successive_relays
 
 PLANT = hg.LinearPlant([[1.1, 0.2], [0.2, 0.8]], np.eye(2), [0.0, 0.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 1.0]], 1.0)
@@ -34,12 +35,10 @@ class Circuit(NamedTuple):
 
 def circuit() -> Circuit:
     """Relays designed for the best receiver behind them, not each for its own error, in the published network."""
-    network = setting.circuit()
+    network = successive_relays.Setting().network()
     as_published = hg.relays.periodic_local_error_design(network)
     power, published = as_published.total_power(), float(as_published.trace("receiver")[1:].sum())
-    start = {name: np.zeros((2, 3, 1)) for name in setting.QUIET}
-    for name, (slot, gains) in setting.QUIET.items():
-        start[name][slot, :, 0] = gains
+    start = dict(successive_relays.QUIET_START)
 
     def error(share: float) -> float:
         gains = hg.relays.periodic_relays_for_best_receiver(network, start, power_limit=share * power)

@@ -18,10 +18,6 @@ KAPPA = np.array([1.02, 1.05, 1.02, 1.1, 1.02, 1.05])  # E g^2 / (E g)^2 of a si
 RELAYED_KAPPA = 1.02
 NAMES = tuple("abcdef")
 
-VARIANCE = 4e-6  # of the circuit's noises
-SPREAD = 0.01  # of its gains
-QUIET = {"relay_1": (1, (0.39, -0.21, 0.033)), "relay_2": (0, (0.84, -0.42, 0.13))}  # the slot and gains to begin from
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -73,23 +69,3 @@ def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
 def slow_state() -> Paths:
     """A state that hardly moves, received over two hops without fading."""
     return hg.planning.independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
-
-
-def circuit() -> hg.model.RelayNetwork:
-    """Two relays in turn that filter and forward what they receive of a circuit, as published."""
-    drive = np.array([[0.6], [0.5], [0.3]])
-    plant = hg.LinearPlant(
-        [[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]],
-        VARIANCE * drive @ drive.T,
-        [0.3, 0.2, -0.2],
-        np.diag([0.05, 0.02, 0.03]),
-    )
-    sensor = hg.LinearSensor([[2.0, 1.8, 2.5]], 0.36 * VARIANCE)
-
-    def link(mean: float, noise: float = VARIANCE) -> hg.random_affine.GainAndNoise:
-        squared = np.log(1 + SPREAD / mean**2)
-        return hg.hop(hg.random_affine.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
-
-    odd = {"relay_2": {"sensor": link(0.92), "relay_1": link(0.9, 0.0)}, "receiver": {"relay_1": link(0.9)}}
-    even = {"relay_1": {"sensor": link(0.9), "relay_2": link(0.9, 0.0)}, "receiver": {"relay_2": link(0.92)}}
-    return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), (odd, even))

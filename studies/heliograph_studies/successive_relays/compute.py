@@ -13,6 +13,7 @@ from heliograph.relays import RelayDesign
 from heliograph.relays.design import GainsByFilter
 from heliograph_studies import Stages, Unlisted
 from heliograph_studies.successive_relays.certificate import RelayCertificate, certify_relays
+from heliograph_studies.successive_relays.misprints import alternating
 from heliograph_studies.successive_relays.setting import QUIET_START, Setting, shadowing
 
 MISPRINTS = ("none", "lemma_1", "theorem_1", "lemma_7", "lemma_6_sign", "lemma_6_last")
@@ -209,12 +210,8 @@ def steady(setting: Setting) -> dict[str, Steady]:
     """The two-periodic steady state of each design."""
     network = setting.network()
     paper = hg.relays.periodic_local_error_design(network)
-    listen = {"relay_1": 1, "relay_2": 0}  # slots: odd, even
-    start = {name: np.zeros((2, 3, 1)) for name in listen}
-    for name, slot in listen.items():
-        start[name][slot, :, 0] = QUIET_START[name]
     limited = paper.total_power()
-    tuned = [hg.relays.periodic_relays_for_best_receiver(network, s) for s in (None, start)]
+    tuned = [hg.relays.periodic_relays_for_best_receiver(network, s) for s in (None, QUIET_START)]
     quiet = hg.relays.periodic_relays_for_best_receiver(network, tuned[1], power_limit=limited)
     relays = {"lmmse": paper.gains, "lmmse_tuned": min(tuned, key=lambda g: _behind(network, g).even
               + _behind(network, g).odd), "lmmse_tuned_from_paper": tuned[0], "lmmse_quiet": quiet}  # fmt: skip
@@ -306,13 +303,7 @@ def simulate(setting: Setting, design: RelayDesign, stages: Stages) -> Simulated
 def counterexample() -> RelayCertificate:
     """A scalar system that is bounded as Lemmas 8 and 9 ask, and obeys none of their printed lower bounds."""
     plant = hg.LinearPlant([[0.5]], [[1.0]], [0.0], [[10.0]])
-    law = shadowing(0.5, 0.1)
-    noisy, quiet = hg.hop(law, 1e6), hg.hop(law, 0.0)
-    slots = [
-        {"relay_2": {"sensor": noisy, "relay_1": quiet}, "receiver": {"relay_1": noisy}},
-        {"relay_1": {"sensor": noisy, "relay_2": quiet}, "receiver": {"relay_2": noisy}},
-    ]
-    network = hg.model.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
+    network = alternating(plant, hg.LinearSensor([[1.0]], [[1.0]]), shadowing(0.5, 0.1), 1e6, 1e6)
     return certify_relays(network, hg.relays.local_error_design(network, 60).gains)
 
 

@@ -31,7 +31,7 @@ def without_fading(setting: Setting) -> float:
     return float(hg.relays.local_error_design(certain, 10).trace("receiver")[10])
 
 
-def _alternating(
+def alternating(
     plant: hg.LinearPlant, sensor: hg.LinearSensor, law: hg.random_affine.LogNormal, relay: float, remote: float
 ) -> hg.model.RelayNetwork:
     """Two relays in turn over one law of gains, with these noises at relay and remote filter."""
@@ -46,7 +46,7 @@ def largest_noise() -> float:
     """Smallest eigenvalue of Xi_1 at k = 40 where relays receive next to nothing and noise is unequal."""
     plant = hg.LinearPlant(0.1 * np.eye(2), np.diag([0.01, 1.0]), np.zeros(2), 0.01 * np.eye(2))
     sensor = hg.LinearSensor([[1.0, 1.0]], [[1.0]])
-    network = _alternating(plant, sensor, shadowing(0.5, 0.1), 1e6, 1e6)
+    network = alternating(plant, sensor, shadowing(0.5, 0.1), 1e6, 1e6)
     return float(np.linalg.eigvalsh(hg.relays.local_error_design(network, 40).covariance["relay_1"][-1])[0])
 
 
@@ -54,7 +54,7 @@ def noise_squared() -> dict[str, object]:
     """P_4 of a scalar system with O = 100, and (52) with o = O^2 and with o = O."""
     tau, w, noise, order = 0.81, 1e-6, 100.0, 4
     plant, sensor = hg.LinearPlant([[0.9]], [[w]], [0.0], [[10.0]]), hg.LinearSensor([[1.0]], [[1e-6]])
-    network = _alternating(plant, sensor, shadowing(1.0, 1e-6), 1e-6, noise)
+    network = alternating(plant, sensor, shadowing(1.0, 1e-6), 1e-6, noise)
     bounds, upper = [10.0, 10.0], 10.0
     for _ in range(order):
         factors = [o / (o + 4 * upper) for o in (noise**2, noise)]
