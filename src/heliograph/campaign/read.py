@@ -183,8 +183,8 @@ def _listed(settings: object, name: str) -> list[Setting]:
 def _check_value(value: object, name: str) -> None:
     """Accept only values that JSON represents without loss."""
     if isinstance(value, dict | list):
-        for item in value.values() if isinstance(value, dict) else value:
-            _check_value(item, name)
+        for entry in value.values() if isinstance(value, dict) else value:
+            _check_value(entry, name)
     elif not isinstance(value, str | bool) and not _is_number(value):
         raise fail(name, "finite numbers, strings, booleans, lists or tables", repr(value))
 

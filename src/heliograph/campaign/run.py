@@ -148,7 +148,7 @@ def _compute(
     total = already + len(missing)
     progress("simulating", already, total)
     failed |= _try(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
-    return dict(sorted(failed.items(), key=lambda item: (item[0].setting, item[0].chunk or 0)))
+    return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
 
 
 def _jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:

@@ -12,7 +12,7 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, place, scalars, traced, type_of
+from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
 from heliograph.codegen.memory import LARGE, InMemory
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import InputError, fail
@@ -139,7 +139,7 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     equations = list(_equations(program.jaxpr))
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
-            raise no_c(equation.primitive.name, place(equation))
+            raise no_c(equation.primitive.name, code_line(equation))
     # Symmetry by induction: assume it for all arrays, drop those that a step does not keep symmetric, repeat.
     estimate, names = filter.estimate(state), names_of(state)
     symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
@@ -156,7 +156,7 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     return StepProgram(
         filter=filter,
         graph=graph,
-        leaves=[Leaf(*part) for part in parts],
+        leaves=[Leaf(*fields) for fields in parts],
         z=of_z,
         u=of_u,
         k=of_k,
@@ -188,7 +188,7 @@ def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGrap
         with jax.enable_x64(True):
             outputs = [lowering.nodes(x) for x in lowering.inline(program, values)]
     except Unsupported as error:
-        raise no_c(error.operation, error.place) from None
+        raise no_c(error.operation, error.where) from None
     return graph, inputs, outputs
 
 
@@ -200,7 +200,7 @@ def no_c(operation: str, where: str) -> InputError:
 def place_of(operation: str, equations: list[Any]) -> str:
     """Return the source line of an operation of the graph."""
     same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
-    return next((place(e) for e in same), "an unknown line")
+    return next((code_line(e) for e in same), "an unknown line")
 
 
 def names_of(state: PyTree) -> list[str]:

@@ -100,8 +100,8 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] 
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
     instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
-    for item in (estimates := items("fusion", estimates, "estimates")):
-        instance("fusion", item, Estimate, "estimates")
+    for estimate in (estimates := items("fusion", estimates, "estimates")):
+        instance("fusion", estimate, Estimate, "estimates")
     if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
@@ -282,7 +282,8 @@ class Fusion(Module):
         rule: the fusion rule.
         quantizer: of each node's mean on its way to the fusion centre or to its neighbours; one for all nodes, or one
             for each by its name, all of one kind; None by default. The covariance is widened by the quantizer's error.
-            Covariances are assumed to arrive as they are: most are computed before any data.
+            Between neighbours a mean beyond its amplitude does not arrive, and the claim is "nominal". Covariances are
+            assumed to arrive as they are: most are computed before any data.
         uplink: the link of the quantized mean, for rules that use reports (`AllReports`); one for all nodes, or one for
             each node by its name; None by default.
         neighbours: names of those whom each node receives, such as {"a": ["b", "c"], "b": []}, or a networkx graph of
@@ -338,13 +339,13 @@ class Fusion(Module):
         self.rule.check(len(nodes))
         if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
             raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
-        for item in self._quantizers(nodes):
-            if not isinstance(first(item), AbstractQuantizer):
-                raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
-            first(item).check(n)
-            if first(item).silent and not self.rule.uses_reports:
+        for quantizer in self._quantizers(nodes):
+            if not isinstance(first(quantizer), AbstractQuantizer):
+                raise fail("quantizer", "an AbstractQuantizer", type(quantizer).__name__)
+            first(quantizer).check(n)
+            if first(quantizer).silent and not self.rule.uses_reports:
                 expected = "a rule that uses reports (AllReports)"
-                raise fail(f"fusion through {type(first(item)).__name__}", expected, type(self.rule).__name__)
+                raise fail(f"fusion through {type(first(quantizer)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
             self._check_reports(nodes, n)
         self.uplinks(nodes)
@@ -361,10 +362,10 @@ class Fusion(Module):
             raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
         for link in self.links(nodes):
             instance("report link", link, ReportLink, "a ReportLink").check(n)
-        for item in self._quantizers(nodes):
-            if isinstance(item, OverTime):
+        for quantizer in self._quantizers(nodes):
+            if isinstance(quantizer, OverTime):
                 raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-            item.error(n)
+            quantizer.error(n)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""
@@ -374,7 +375,7 @@ class Fusion(Module):
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
         """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
-        return [item for item in self._quantizers(nodes) if isinstance(item, AbstractQuantizer)]
+        return [quantizer for quantizer in self._quantizers(nodes) if isinstance(quantizer, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
         """Quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.

@@ -52,14 +52,14 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     # U = P + E E' in these units.
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    result = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
-    weights = regular_solve(result @ ones, result).reshape(n, nodes, n)
+    unscaled = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
+    weights = regular_solve(unscaled @ ones, unscaled).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
 @compiled
 def factored_weights(
-    shared: Float[Array, "node n sources"], local: Float[Array, "node n n"]
+    shared: Float[Array, "node n sources"], independent: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
     """Matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
@@ -67,7 +67,7 @@ def factored_weights(
     """
     nodes, n, sources = shared.shape
     # Whitened by B: L and E.
-    factors = jnp.linalg.cholesky(jnp.asarray(local))
+    factors = jnp.linalg.cholesky(jnp.asarray(independent))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
     common, e = white[:, :sources], white[:, sources:]
@@ -89,8 +89,8 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n)."""
     nodes, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", jnp.asarray(joint))
-    items = jax.vmap(lambda item: matrix_weights(item.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
-    return jnp.einsum("ai,ab->aib", items, jnp.eye(n))
+    weights = jax.vmap(lambda block: matrix_weights(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
+    return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
 
 
 @_of_joint

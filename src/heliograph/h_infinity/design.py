@@ -158,8 +158,8 @@ def horizon_design(
     if not status.startswith("optimal") or values is None:
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     # the solver's answer must satisfy every step's inequality itself
-    parts = [np.asarray(values[place]) for place in problem.places]
-    solved = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
+    parts = [np.asarray(values[entries]) for entries in problem.places]
+    solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
     weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, solved)]
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
@@ -203,21 +203,21 @@ class _Recursion:
         for k, step in enumerate(self.steps):
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
-            status, result = self._problem(k, present if k == 0 else None).solve(fixed)
-            if result is None or not _holds(step, result, fixed, SCREEN):
+            status, unknowns = self._problem(k, present if k == 0 else None).solve(fixed)
+            if unknowns is None or not _holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _block(result)
-            design.gains[k] = c.gain(step.nominal + _gain(result), k)
+            present = _block(unknowns)
+            design.gains[k] = c.gain(step.nominal + _gain(unknowns), k)
             design.weights[k + 1] = relative * c.weight(present, k + 1)
-            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(result, k), self.separate)
+            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
         coupling = _coupling(start, self.system.states)
-        for item, single, coupled, problem in self.compiled:
-            if all(map(np.array_equal, item, step)) and single == sizes and coupled is coupling is None:
+        for matrices, single, coupled, problem in self.compiled:
+            if all(map(np.array_equal, matrices, step)) and single == sizes and coupled is coupling is None:
                 return problem
         problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
         self.compiled.append((step, sizes, coupling, problem))

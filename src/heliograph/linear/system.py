@@ -113,8 +113,8 @@ def over_horizon(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
 
 
 def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    result: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
-    return result
+    numbers: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
+    return numbers
 
 
 class StateMoments(NamedTuple):

@@ -40,8 +40,8 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    result: Channel = at_each_step(_centred, channel, reference)
-    return result
+    less_reference: Channel = at_each_step(_centred, channel, reference)
+    return less_reference
 
 
 def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:

@@ -188,8 +188,8 @@ def mean_gain(channel: Channel) -> Channel:
         check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [channel])[0])
         return channel.mean_gain()
 
-    result: Channel = at_each_step(mean_of, channel)
-    return result
+    at_mean: Channel = at_each_step(mean_of, channel)
+    return at_mean
 
 
 def check_link(
@@ -239,14 +239,14 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
         case GainAndNoise():
             return _through(channel, sent)
         case Series():
-            for part in channel.maps:
-                sent = carried(part, sent)
+            for affine in channel.maps:
+                sent = carried(affine, sent)
             return sent
         # Outputs of parts stand one after another.
         case Stack():
-            starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
+            starts = np.cumsum([0, *(affine.outputs for affine in channel.maps)])
             items = zip(starts, channel.maps, strict=False)
-            return tuple(int(start) + i for start, part in items for i in carried(part, sent))
+            return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
         case Erasure() | OneStepLate():
             return carried(channel.base, sent)
         case Delayed():  # one of the angles that were sent arrives; a time stamp stands after it

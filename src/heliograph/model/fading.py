@@ -172,7 +172,7 @@ def without_memory(channel: Channel) -> Channel:
         return channel
     if not isinstance(channel, OverTime):
         return forgetful(channel)
-    steps = [joint_modes(item, order=2) for item in unstack(channel)]
+    steps = [joint_modes(step, order=2) for step in unstack(channel)]
     return over_time([mixed(step, law) for step, law in zip(steps, laws(steps), strict=True)])
 
 
@@ -188,7 +188,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(item) for item in unstack(channel)]
+    steps = [joint_modes(step) for step in unstack(channel)]
     return not harmless(steps, not isinstance(channel, OverTime))
 
 

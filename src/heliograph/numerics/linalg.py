@@ -134,8 +134,8 @@ def sum_of_squares(
 @jax.custom_jvp
 def spread_of(gain: jax.Array, noise: jax.Array) -> jax.Array:
     """K N K' of a positive semidefinite N as a square, by a root of N; its derivatives are those of the product."""
-    part = times(gain, root(noise))
-    return times(part, transpose(part))
+    half = times(gain, root(noise))
+    return times(half, transpose(half))
 
 
 @spread_of.defjvp
@@ -211,8 +211,8 @@ def long_factor(a: jax.Array) -> jax.Array:
         column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], whole[j]), 0.0)
         return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
 
-    result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
-    return result
+    lower: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
+    return lower
 
 
 def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:

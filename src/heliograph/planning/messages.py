@@ -90,8 +90,8 @@ def simulated_rate(
     """
     check_count("runs", runs, 2)
     check_count("horizon", horizon, 4)
-    item = event_filter(plant, sensor, channel, trigger)
-    node = Node(sensor, channel, {"event": item}, trigger=trigger)
+    filter = event_filter(plant, sensor, channel, trigger)
+    node = Node(sensor, channel, {"event": filter}, trigger=trigger)
     record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
     sent = record.transmissions["sender"][:, horizon // 4 :] != 0
     by_run = sent.mean(axis=(1, 2))

@@ -59,13 +59,14 @@ def _ordered(record: Record) -> list[str]:
 def _tested(health: Health) -> dict[str, list[FilterHealth]]:
     """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
     tested = sorted(
-        (filter for filter in health.filters if filter.white is not None), key=lambda item: item.node != FUSED
+        (filter for filter in health.filters if filter.white is not None),
+        key=lambda tested_filter: tested_filter.node != FUSED,
     )
     if len(tested) <= FEW:
         return {"innovations": tested} if tested else {}
     nodes: dict[str, list[FilterHealth]] = {}
-    for item in tested:
-        nodes.setdefault(item.node, []).append(item)
+    for tested_filter in tested:
+        nodes.setdefault(tested_filter.node, []).append(tested_filter)
     return {f"innovations_{i}": filters for i, filters in enumerate(list(nodes.values())[:MOST])}
 
 
@@ -100,17 +101,17 @@ def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
     names = _components(health)
-    for axes, item in zip(grid, tested, strict=True):
-        white = np.asarray(item.white)
+    for axes, tested_filter in zip(grid, tested, strict=True):
+        white = np.asarray(tested_filter.white)
         # A colour for each output; of more outputs than colours, such as a centre's, one for all.
         alike = white.shape[1] > len(COLOURS)
         for i, component in enumerate(white.T):
-            name, colour = ("outputs", BLUE) if alike else (names[item.node][i], COLOURS[i])
+            name, colour = ("outputs", BLUE) if alike else (names[tested_filter.node][i], COLOURS[i])
             label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
             axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
-        axes.set_title(in_figure(f"{item.node}/{item.filter}"))
+        axes.set_title(in_figure(f"{tested_filter.node}/{tested_filter.filter}"))
         axes.set_ylabel("in deviations")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
     _time_axis(health, grid[-1])
@@ -162,13 +163,13 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     ]
     # Filtered estimates, then smoothed ones if there are any.
     estimates: list[Picture | Choice] = []
-    for kind, item in _estimated(health):
+    for kind, record_of_kind in _estimated(health):
         added = ", given later data too" if kind == "smoothed" else ""
         estimates += _chosen({
             node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                           f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
                           f"side{added}.")
-            for i, node in enumerate(_nodes(item))
+            for i, node in enumerate(_nodes(record_of_kind))
         })  # fmt: skip
     # Warnings are in the title and in the first section.
     return Page(
@@ -197,9 +198,9 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
 def errors_table(record: Record) -> list[Table]:
     """Return the errors of each filter where the recording has the true state."""
     rows = [
-        [visible(f"{item.node}/{item.filter}"), item.claim, *(f"{value:.4g}" for value in item.rmse.values()),
-         "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
-        for item in errors_of(record)
+        [visible(f"{errors.node}/{errors.filter}"), errors.claim, *(f"{value:.4g}" for value in errors.rmse.values()),
+         "–" if np.isnan(errors.nees) else f"{errors.nees:.3g}"]
+        for errors in errors_of(record)
     ]  # fmt: skip
     # What the columns are, in words.
     caption = (
@@ -223,8 +224,8 @@ def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
         return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
-    result = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
-    return f"Nothing is lost that the network says cannot be lost, and {result}."
+    tests = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
+    return f"Nothing is lost that the network says cannot be lost, and {tests}."
 
 
 def _counted(count: int, what: str) -> str:
@@ -242,7 +243,7 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
 
 
 def _by_name(health: Health) -> str:
-    names = [visible(f"{item.node}/{item.filter}") for item in health.doubted()]
+    names = [visible(f"{doubted.node}/{doubted.filter}") for doubted in health.doubted()]
     return f": {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}" if names else ""
 
 
@@ -256,7 +257,7 @@ def _compared(health: Health) -> list[Text | Points]:
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture | Choice]:
     # One row for each filter, fused ones first: size, correlation and p-value of its innovations.
     rows = []
-    for tested_filter in sorted(health.filters, key=lambda item: item.node != FUSED):
+    for tested_filter in sorted(health.filters, key=lambda judged: judged.node != FUSED):
         test, name = tested_filter.test, visible(f"{tested_filter.node}/{tested_filter.filter}")
         if test is None:
             rows.append([name, tested_filter.claim, "–", "–", "–"])
@@ -288,11 +289,13 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
     }  # fmt: skip
     drawn = {filter.node for filters in tested.values() for filter in filters}
     left = [
-        f"{item.node}/{item.filter}" for item in health.filters if item.white is not None and item.node not in drawn
+        f"{judged.node}/{judged.filter}"
+        for judged in health.filters
+        if judged.white is not None and judged.node not in drawn
     ]
     table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
     # Fusions of estimates, which are in no row.
-    listed = {(item.node, item.filter) for item in health.filters}
+    listed = {(judged.node, judged.filter) for judged in health.filters}
     fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
     if fusions:
         text += (
@@ -385,10 +388,10 @@ def run_summary(health: Health) -> dict[str, Json]:
         outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.output] = output_numbers(output)
     # Errors, where the truth is known.
     errors: dict[str, dict[str, Json]] = {}
-    for item in errors_of(health.record):
-        size = None if np.isnan(item.nees) else item.nees
-        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in item.rmse.items()}
-        errors.setdefault(item.node, {})[item.filter] = {"rmse": rmse, "nees": size}
+    for of_filter in errors_of(health.record):
+        size = None if np.isnan(of_filter.nees) else of_filter.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
+        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
     # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:

@@ -150,16 +150,16 @@ class KnownLosses(NamedTuple):
     @property
     def exact(self) -> bool:
         """True where nothing that arrives is left out."""
-        return all(part.exact for part in self.parts)
+        return all(outcome.exact for outcome in self.parts)
 
     @property
     def random(self) -> bool:
         """True where random gains make something unusable."""
-        return any(part.random for part in self.parts)
+        return any(outcome.random for outcome in self.parts)
 
     def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
         """Gains on what arrives, from those on its sums of known gain."""
-        return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
+        return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
@@ -180,7 +180,7 @@ def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.nd
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(parts[s].noise(o, links) for _, o, s in weights)
-    system = KnownLossSystem(a, q, chain, law, values, tuple(part.rows for part in parts), noises)
+    system = KnownLossSystem(a, q, chain, law, values, tuple(outcome.rows for outcome in parts), noises)
     return KnownLosses(system, kinds, parts)
 
 

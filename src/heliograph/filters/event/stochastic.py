@@ -100,8 +100,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         modes = len(state.law)
         size = initial_size(at(self.plant, 0))
         belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
-        result, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
-        came = join(Parts(safe_log(weight), result.mean, result.covariance, jnp.eye(len(weight))[:, None]))
+        posteriors, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
+        came = join(Parts(safe_log(weight), posteriors.mean, posteriors.covariance, jnp.eye(len(weight))[:, None]))
 
         # Nothing: the link was down, and the prior stays; or the sender was silent.
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
@@ -111,7 +111,10 @@ class StochasticEventFilter(AbstractSizedFilter):
             parts.append(_alone(jnp.zeros(()), prior, state.law).labelled(0, state.law[None] * lost))
         if len(down):
             up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [parts[0].times(up), *(part.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for part in parts[1:])]
+            parts = [
+                parts[0].times(up),
+                *(hypothesis.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for hypothesis in parts[1:]),
+            ]
         nothing = join(together(parts))
 
         there = jnp.any(~jnp.isnan(values))
@@ -141,7 +144,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link where all of what was sent arrives."""
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
-            jnp.tensordot(whole, jnp.asarray(part), 2) / jnp.sum(whole) for part in (channel.mean, channel.spread)
+            jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
         )
         return gain[:, :-1], spread
 
@@ -212,5 +215,5 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 
 def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:
-    mean, covariance, law = (jnp.asarray(part)[None] for part in (belief.mean, belief.covariance, law))
+    mean, covariance, law = (jnp.asarray(moment)[None] for moment in (belief.mean, belief.covariance, law))
     return Parts(log_weight[None], mean, covariance, law[None])

@@ -89,8 +89,8 @@ class AbstractModalFilter(AbstractSizedFilter):
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
         of_outputs = output_rounding(at(self.sensor, k).matrix, initial_size(at(self.plant, 0)))
         of_mean = jnp.max(jnp.abs(gains[..., :-1]) @ of_outputs, axis=0)
-        result: jax.Array = of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
-        return result
+        variance: jax.Array = of_mean**2 + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
+        return variance
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
         return sum_of_modes(len(self.states), len(self.initial))

@@ -107,8 +107,8 @@ class FedBackFilter(AbstractSizedFilter):
         """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
         plant, sensor = at(self.base.plant, k), at(self.base.sensor, k)
         expected = plant.transition(jnp.asarray(known), jnp.asarray(u)) + plant.noise_mean()
-        result: jax.Array = sensor.measure(expected) + sensor.noise.mean
-        return result
+        signal: jax.Array = sensor.measure(expected) + sensor.noise.mean
+        return signal
 
     @in_float64
     def init(self) -> FedBackBelief:

@@ -159,8 +159,8 @@ def power_task(
     def information(powers: Powers) -> PathInformation:
         every = fixed.copy()
         every[:, free] = powers
-        result = path_information(paths, every)
-        return PathInformation(result.information, result.slope[:, free])
+        of_paths = path_information(paths, every)
+        return PathInformation(of_paths.information, of_paths.slope[:, free])
 
     # Where no total is given: that of the other limits, or so much that a hop's noise hardly counts.
     total = limits.total
@@ -196,7 +196,7 @@ def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
     """Powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
-        whole = SplitPaths(*(part[:, problem.path] for part in task.whole()))
+        whole = SplitPaths(*(values[:, problem.path] for values in task.whole()))
         starts = [water_filling(problem.limits, problem.sensitivity, whole, starts[0])]
     powers = problem.solve(starts)
     assert powers is not None  # the starts are within the limits

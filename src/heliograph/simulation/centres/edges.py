@@ -130,26 +130,27 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
         wrong = sorted(set(fusion.link) ^ set(names))[:3]
         raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
     channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
-    for channel in {id(c): c for c in channels}.values():
-        check_edge(channel)
+    several = isinstance(fusion.link, Mapping)
+    for name, channel in {id(c): (name, c) for name, c in zip(names, channels, strict=True)}.values():
+        check_edge(f"link {name!r}" if several else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     groups, past = channel_groups(dict(zip(names, channels, strict=True))), max(first(c).past for c in channels)
     return Edges(groups, slots, graph.present, fusion.rounds, past)
 
 
-def check_edge(link: Channel) -> None:
+def check_edge(what: str, link: Channel) -> None:
     """Refuse a link that changes a message, and losses or delays that the receiver does not know of."""
-    instance("link between neighbours", first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
+    instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for item in unstack(link):
         late = late_part(item)
         if late is not None and not (late.constant or late.timestamped):
-            raise fail("link between neighbours", "delays that the receiver knows (timestamped=True)", "others")
+            raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         inside = _without_losses(item)
         inside = inside if late is None else _without_losses(late.link)
         for part in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
             if part.remembers or part.past or not _is_perfect(part):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
-                raise fail("link between neighbours", expected, type(first(link)).__name__)
+                raise fail(what, expected, type(first(link)).__name__)
 
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_flow
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
-from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, weakest
@@ -20,7 +20,8 @@ from heliograph.numerics.check import fail, instance
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import edges_of, loss_rate
+from heliograph.simulation.centres.edges import arrival_chance, edges_of, loss_rate
+from heliograph.simulation.centres.mesh_decay import check_decay
 from heliograph.simulation.node import Node
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     if unknown := sorted(set(neighbours) - set(network.nodes)):
         raise fail(what, f"nodes of the network {list(network.nodes)[:5]}", f"unknown ones {unknown[:5]}")
     if network.relays is not None or network.common is not None:
-        kind = "relays" if network.relays is not None else "nodes that share a channel: stack their measurements"
+        sharing = [node for node in network.mesh_nodes(name) if network.nodes[node].received][:5]
+        kind = "relays" if network.relays is not None else f"{sharing}, which share a channel: stack their measurements"
         raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", kind)
     if not isinstance(first(network.plant), LinearPlant):
         raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
@@ -61,20 +63,22 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     mesh_claim(name, fusion, network)
     _check_seen(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
+    _check_fixed(what, fusion, network, graph)
 
 
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
-    Weaker where laws are known up to a radius, weights are frozen means over losses, or a sender decides by what it
-    measured.
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
+    sender by what it measured, a quantizer by what it cannot send.
     """
     parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
              for node in network.mesh_nodes(name)
              if isinstance(item := network.nodes[node], Node)}  # fmt: skip
     known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
     senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
-    if isinstance(fusion.rule, FrozenWeights) or any(item.trigger is not None for item in senders):
+    by_data = fusion.quantizer is not None or any(item.trigger is not None for item in senders)
+    if by_data or isinstance(fusion.rule, FrozenWeights):
         return "nominal"
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
@@ -139,10 +143,9 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     squares = np.zeros((len(nodes), n, n))
     for i, item in enumerate(sensors):
         if isinstance(item, Node):
-            h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(item.sensor))
-            squares[i] = h.T @ h
-            noise = np.asarray(first(item.sensor).noise.covariance)
-            _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
+            h, noise = _model(item)
+            squares[i] = _scaled(h).T @ _scaled(h)
+            _check_regular(f"{what}: node {nodes[i]!r}", noise)
     # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
     unseen: dict[bool, list[str]] = {True: [], False: []}
     values = np.linalg.eigvals(a)
@@ -200,8 +203,7 @@ def _sees(item: object, vector: np.ndarray) -> bool:
     """Test whether a node's own measurement shows a mode."""
     if not isinstance(item, Node):
         return False
-    h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(first(item.sensor)))
-    return bool(np.any(np.abs(h @ vector) > RANK))
+    return bool(np.any(np.abs(_scaled(_model(item)[0]) @ vector) > RANK))
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
@@ -221,16 +223,42 @@ def _scaled(h: np.ndarray) -> np.ndarray:
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
-def _matrix(sensor: object) -> np.ndarray:
+def _model(item: Node) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
+    sensor, channel = first(item.sensor), second_order(arrived(first(item.channel)))
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
-    return np.asarray(sensor.matrix)
-
-
-def _check_regular(where: str, noise: np.ndarray, item: Node) -> None:
-    """Refuse a measurement without noise in some direction: its information has no number."""
-    channel = second_order(arrived(first(item.channel)))
     gain = np.asarray(channel.mean_gain)
-    total = gain @ noise @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
-    scale = np.sqrt(np.maximum(np.diagonal(total), 0.0))
-    if np.any(scale == 0) or np.linalg.eigvalsh(total / np.outer(scale, scale))[0] < RANK:
+    noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
+    return gain @ np.asarray(sensor.matrix), noise
+
+
+def _check_regular(where: str, noise: np.ndarray) -> None:
+    """Refuse a measurement without noise in some direction: its information has no number."""
+    scale = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
+    if np.any(scale == 0) or np.linalg.eigvalsh(noise / np.outer(scale, scale))[0] < RANK:
         raise fail(where, "measurement noise in every direction", "a singular covariance")
+
+
+def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+    """Refuse fixed shares with which errors grow, where the plant does not decay and gains become steady."""
+    plant, link, names = network.plant, fusion.link, graph.nodes
+    if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:
+        return
+    a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(np.zeros(len(plant.inputs))))
+    items = [network.nodes[name] for name in names]
+    rates = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
+             for j, i in graph.edges]  # fmt: skip
+    arrival = np.array([p for p in rates if p is not None])
+    steady = all(_is_steady(item) for item in items if isinstance(item, Node))
+    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
+        return
+    models = [_model(item) if isinstance(item, Node) else (np.zeros((1, len(a))), np.eye(1)) for item in items]
+    squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
+    check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
+
+
+def _is_steady(item: Node) -> bool:
+    """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
+    if isinstance(item.sensor, OverTime) or isinstance(item.channel, OverTime):
+        return False
+    return not np.any(np.asarray(second_order(arrived(item.channel)).nominal.center)[:, :, :-1, :-1])
