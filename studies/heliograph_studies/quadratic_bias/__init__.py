@@ -56,14 +56,14 @@ def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """All statements that the example and the scenario speak to, with the numbers that decide."""
     variance, beyond = outcome.example.covariance, outcome.outage.monte_carlo[TRUE]["minus_linear"]
     states = outcome.example.model.states[:2]
-    found = [[getattr(Noises(), name).law().moment((k,)) for k in (2, 3, 4)] for name in TABLE_1]
+    moments = [[getattr(Noises(), name).law().moment((k,)) for k in (2, 3, 4)] for name in TABLE_1]
     numbers = {
         "printed": TRUE,
         "claimed": CLAIMED,
         "worst": min(100 * (1 - variance[TRUE][s][1:] / variance["linear"][s][1:]).min() for s in states),
         "excess": Sampled(beyond["x"], beyond["x_se"]),
-        "largest_gap": np.abs(np.array(found) - list(TABLE_1.values())).max(),
-        "refused": [name for name, moments in TABLE_1.items() if not _of_some_law(moments)],
+        "largest_gap": np.abs(np.array(moments) - list(TABLE_1.values())).max(),
+        "refused": [name for name, row in TABLE_1.items() if not _of_some_law(row)],
     }
     return stated(__file__, {**vars(outcome), **numbers})
 
