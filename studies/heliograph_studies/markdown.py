@@ -104,7 +104,7 @@ def filled(template: Path, numbers: Mapping[str, object]) -> str:
 
 
 def with_error(pair: tuple[float, float], digits: str = "") -> str:
-    """A number and its standard error, both as Python's format writes them, with every digit unless told."""
+    """A number and its standard error, both as Python's format writes them; every digit by default."""
     return f"{pair[0]:{digits}} ± {pair[1]:{digits}}"
 
 
