@@ -78,7 +78,7 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
     by_data = fusion.quantizer is not None or any(item.trigger is not None for item in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):
-        return "nominal"
+        return weakest([known, "nominal"])
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
