@@ -125,11 +125,15 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 def thresholds(setting: Setting) -> dict[str, Any]:
     """Critical arrivals and recoveries, and verdicts on either side of them."""
     scalar, always = setting.scalar, judge(setting.scalar, lossy(1.0))
+
+    def recovery(fail: float) -> float:
+        return _smallest(lambda recover: judge(scalar, bursts(fail, recover)), setting.digits)
+
     steady = always.gains[(True,) * len(scalar.output)]  # certified where every packet arrives
     return {
         "critical": {name: hg.linear.critical_arrival(e.plant(), e.sensor()) for name, e in setting.examples.items()},
         "constant": hg.linear.critical_arrival(scalar.plant(), scalar.sensor(), steady),
-        "recovery": {fail: critical_recovery(setting, fail) for fail in (0.01, 0.1, 0.5)},
+        "recovery": {fail: recovery(fail) for fail in (0.01, 0.1, 0.5)},
         "components": (critical_component(setting, 0), critical_component(setting, 1)),
         "verdicts": verdicts(setting),
     }
@@ -213,11 +217,6 @@ def lower(example: Example, fail: float, recover: float) -> float:
     start = (lost * q).ravel()  # fail w_0 + (1 - recover) w_1 = w_1
     s = np.linalg.solve(np.eye(n * n) - (1 - recover) * square, start).reshape(n, n)
     return float(np.trace(s + recover * a @ s @ a.T + (1 - lost) * q))
-
-
-def critical_recovery(setting: Setting, fail: float) -> float:
-    """The smallest probability of recovery at which the scalar example is certified, by bisection on verdicts."""
-    return _smallest(lambda recover: judge(setting.scalar, bursts(fail, recover)), setting.digits)
 
 
 def critical_component(setting: Setting, which: int) -> float:
