@@ -18,17 +18,21 @@ def mean_error(example: Example, fail: float, recover: float) -> float:
     mean of x + g(x) + ... + g^l(x) over that of l + 1.
     """
     a, c, q, r = (float(np.squeeze(v)) for v in (example.transition, example.output, example.process, example.noise))
+    # g^l(x) = a^(2 l) x + q (a^(2 l) - 1) / (a^2 - 1), and the law of l.
     lasts = np.arange(LOSSES)
     after = np.where(lasts == 0, 1.0, fail * (1 - recover) ** np.maximum(lasts - 1.0, 0.0))  # P(l >= lasts)
     growth = (a * a) ** lasts.astype(float)
     added = q * (growth - 1) / (a * a - 1)
+    # Chebyshev nodes over where P lies after an arrival.
     low, high = q, a * a * r / c**2 + q
     nodes = np.cos(np.pi * (np.arange(DEGREE) + 0.5) / DEGREE)
     before = (low + (high - low) * (nodes + 1) / 2)[:, None] * growth + added
+    # h(g^l(x)): P after the next arrival, and the map of polynomials that its law is.
     following = a * a * before * r / (c * c * before + r) + q
     values = chebyshev.chebvander(2 * (following - low) / (high - low) - 1, DEGREE - 1)
     mean_values = np.einsum("l,xld->xd", after - np.append(after[1:], 0.0), values)
     onward = np.linalg.solve(chebyshev.chebvander(nodes, DEGREE - 1), mean_values)
+    # The map after long: its fixed law; then the mean over the losses that follow.
     for _ in range(SQUARINGS):
         onward = onward @ onward
     mean = low + (high - low) * (onward[0, 1] + 1) / 2  # of any polynomial, in its constant coefficient after long

@@ -153,8 +153,10 @@ def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -
     def named(values: np.ndarray, suffix: str = "") -> dict[str, float]:
         return {f"{state}{suffix}": value.tolist() for state, value in zip(model.states, values, strict=True)}
 
+    # Designed: variances over time, and their means over the steps that count.
     variances = {name: np.diagonal(value, axis1=1, axis2=2) for name, value in designs.covariance.items()}
     means = {name: value[model.begin + 1 :].mean(axis=0) for name, value in variances.items()}
+    # Simulated on the same runs, and their differences to the linear filter.
     squares = {name: _mean_square(part, None, model.begin) for name, part in sums[NODE].items()}
     simulated: dict[str, dict[str, Any]] = {}
     for name, part in sums[NODE].items():

@@ -72,9 +72,11 @@ def certify_relays(network: RelayNetwork, gains: GainsByFilter) -> RelayCertific
     horizon = len(result.state) - 1
     steps = network.steps(horizon)
     c = _constants(network, steps)
+    # Eigenvalues of the error covariances, relays and receiver.
     relays = np.array([np.linalg.eigvalsh(result.covariance[name]) for name in network.relays])
     receiver = np.linalg.eigvalsh(result.covariance[RECEIVER])
     greedy = _greedy(result)
+    # mbar_k = tau mbar_(k-1) + w bounds all of them from above.
     upper = _recursion(c["p0_upper"], np.full(horizon, c["tau_upper"]), c["w_upper"])
     relay_lower, receiver_lower = _over_time(c, upper, relays, receiver, greedy)
     bounds = [
@@ -118,6 +120,7 @@ def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
     def gram(a: Float[np.ndarray, "time n m"]) -> Float[np.ndarray, "time n n"]:
         return np.asarray(a @ np.swapaxes(a, 1, 2))
 
+    # Extreme eigenvalues of A A', C C', W, P_0 and V.
     tau, f, w = extremes(gram(steps.transition)), extremes(gram(steps.sensing)), extremes(steps.process)
     p0, v = extremes(network.initial()[1][None]), extremes(steps.sensor_noise)
     mu, phi, g, o = _link_constants(network, len(steps.live))
@@ -141,6 +144,7 @@ def _link_constants(
     for k in range(horizon):
         for listener, links in network.slots[k % len(network.slots)].items():
             senders, noise = set(links), np.zeros(())
+            # Of the published kind: a relay receives the sensor and one relay, the receiver one relay.
             published = senders < {SENSOR, *network.relays} and len(senders - {SENSOR}) == 1 and listener not in senders
             if not published or (SENSOR in senders) != (listener != RECEIVER):
                 return nothing
@@ -150,6 +154,7 @@ def _link_constants(
                 m = len(offset)
                 mean, variance = gain[0, 0], spread[0, 0, 0, 0]
                 shape = np.einsum("ia,jb->ijab", np.eye(m), np.eye(m))
+                # Over scalar gains: one mean and one variance, whatever the component.
                 square = spread.shape == (m, m, m + 1, m + 1)
                 if not square or np.any(offset) or not np.allclose(gain, mean * np.eye(m)):
                     return nothing
