@@ -10,7 +10,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.numerics.check import fail
-from heliograph_studies import Inline, Stages, Unlisted, check_fields
+from heliograph_studies import Inline, Stages, Unlisted, check_fields, sampled
 from heliograph_studies.cubature_fusion import setting as machine
 
 Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
@@ -173,9 +173,8 @@ def measured(setting: Setting) -> dict[str, dict[str, float]]:
 
 def against_peers(claimed: float, errors: np.ndarray) -> dict[str, float]:
     """The mean of squared errors (runs, n) with its standard error, beside what is claimed of it."""
-    square = np.sum(errors**2, axis=-1)
-    error = float(square.std(ddof=1) / np.sqrt(len(square)))
-    return {"claimed": float(claimed), "measured": float(square.mean()), "standard_error": error}
+    measured, error = sampled(np.sum(errors**2, axis=-1))
+    return {"claimed": float(claimed), "measured": measured, "standard_error": error}
 
 
 def tree(setting: Setting) -> tuple[dict[str, float], list[np.ndarray], dict[str, float]]:

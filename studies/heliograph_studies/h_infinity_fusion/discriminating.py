@@ -9,7 +9,8 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters.wrappers.fed_back import prediction_of
-from heliograph_studies.h_infinity_fusion.example import Mean, mean_and_error
+from heliograph_studies import sampled
+from heliograph_studies.h_infinity_fusion.example import Mean
 from heliograph_studies.h_infinity_fusion.levels import without_gain
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws, World, Worst, worst_disturbance
 
@@ -130,6 +131,7 @@ RUNS = 1_000  # at most: errors here are large and alike
 ENERGIES = (1.0, 160.0, 1000.0)  # where phi is its slope, of order one, and saturated
 SEARCH_DRAWS, JUDGE_DRAWS = 32, 2_000
 Errors = dict[str, Mean]  # by filter
+Designs = dict[str, dict[str, hg.h_infinity.HInfinityDesign]]  # by name and node
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ class Discriminating:
     (time,) the mean of the fused one over runs.
     """
 
-    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
+    designs: Designs
     certificates: dict[str, hg.h_infinity.HInfinityCertificate]
     without_structure: dict[str, float]
     without_structure_or_gain: float
@@ -170,9 +172,9 @@ def discriminate(runs: int, seed: int) -> Discriminating:
     return Discriminating(designs, certificates, flat, blind, finding, *simulated, worst_cases(designs), count)
 
 
-def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
+def design() -> Designs:
     """The horizon and the recursive design of each node at their smallest levels, and what K = 0 proves."""
-    results: dict[str, dict[str, hg.h_infinity.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
+    results: Designs = {"horizon": {}, "recursive": {}, "zero_gain": {}}
     for node in OUTPUTS:
         growing = system(node)
         results["horizon"][node] = hg.h_infinity.horizon_design(growing, separate=True)
@@ -181,9 +183,7 @@ def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     return results
 
 
-def filters(
-    node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
-) -> dict[str, hg.filters.AbstractFilter]:
+def filters(node: str, designs: Designs) -> dict[str, hg.filters.AbstractFilter]:
     """All filters of a node but the one that knows of losses; each predicts."""
     believed, seen, growing = plant(False), sensor(node), system(node)
     results: dict[str, hg.filters.AbstractFilter] = {
@@ -195,7 +195,7 @@ def filters(
     return results
 
 
-def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
+def networks(designs: Designs) -> list[hg.Network]:
     """Network whose receivers do not know of losses, and one whose do, with other draws."""
     believed, certain, losing = plant(False), channel(lossless), channel()
     unaware, informed = {}, {}
@@ -212,7 +212,7 @@ def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> li
 
 
 def simulate(
-    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]], runs: int, seed: int
+    designs: Designs, runs: int, seed: int
 ) -> tuple[dict[str, Errors], dict[str, Errors], dict[str, dict[str, np.ndarray]]]:
     """Mean norm of the error by scenario and filter: fused, of one node, and fused over time."""
     errors: dict[str, Errors] = {scenario: {} for scenario in SCENARIOS}
@@ -223,14 +223,14 @@ def simulate(
             record = hg.monte_carlo(network, STEPS, runs, seed, inputs=inputs(scenario))
             for name in network.fused:
                 norms = np.linalg.norm(record.errors("fused", name), axis=-1)
-                errors[scenario][name] = mean_and_error(norms.mean(axis=1))
+                errors[scenario][name] = Mean(*sampled(norms.mean(axis=1)))
                 over_time[scenario][name] = norms.mean(axis=0)
                 separate = np.linalg.norm(record.errors(NODE, name), axis=-1)
-                local[scenario][name] = mean_and_error(separate.mean(axis=1))
+                local[scenario][name] = Mean(*sampled(separate.mean(axis=1)))
     return errors, local, over_time
 
 
-def worst_cases(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> dict[str, Worst]:
+def worst_cases(designs: Designs) -> dict[str, Worst]:
     """Lower bounds on the true levels of one node's filters; they run on the channel that does not tell."""
     searched = world(NODE), draws(SEARCH_DRAWS, 1), draws(JUDGE_DRAWS, 2)
     return {name: worst_disturbance(item, *searched, ENERGIES) for name, item in filters(NODE, designs).items()}

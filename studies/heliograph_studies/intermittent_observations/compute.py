@@ -11,10 +11,9 @@ import heliograph as hg
 from heliograph.linear import CriticalArrival
 from heliograph.random_affine import AbstractRandomAffine
 from heliograph.simulation import Boundedness
-from heliograph_studies import Stages, Unlisted
+from heliograph_studies import Sampled, Stages, Unlisted
 from heliograph_studies.intermittent_observations.mean_error import (
     Iterated,
-    Simulated,
     from_runs,
     iterate,
     mean_error,
@@ -44,7 +43,7 @@ class Link(NamedTuple):
     judged: Boundedness
     lower: float
     mean_error: float
-    simulated: Simulated
+    simulated: Sampled
 
     @property
     def bound(self) -> float:
@@ -62,9 +61,9 @@ class Link(NamedTuple):
             "lower": self.lower,
             "radius": self.judged.radius,
             "gain": gain[:, 0] if len(gain) > 1 else float(gain[0, 0]),
-            "mean_error": self.mean_error if exact else self.simulated.mean,
+            "mean_error": self.mean_error if exact else self.simulated.value,
             "mean_error_is": "quadrature" if exact else "simulated",
-            "simulated": self.simulated.mean,
+            "simulated": self.simulated.value,
             "simulated_se": self.simulated.error,
         }
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from heliograph_studies import Sampled, sampled
 from heliograph_studies.intermittent_observations.setting import Example
 
 DEGREE, LOSSES, SQUARINGS = 40, 400, 8  # of the polynomials; in a row; of the map from arrival to arrival
@@ -39,14 +40,7 @@ def mean_error(example: Example, fail: float, recover: float) -> float:
     return float((mean * after @ growth + after @ added) / after.sum())
 
 
-class Simulated(NamedTuple):
-    """A mean over runs and its standard error."""
-
-    mean: float
-    error: float
-
-
-def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarray, arrived: np.ndarray) -> Simulated:
+def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarray, arrived: np.ndarray) -> Sampled:
     """tr E P before z from the filter's covariances after z (run, time, n, n) in the steps that had one (run, time).
 
     What losses do is known: with D the part of E P before an arrival, L before a loss, w the share of losses and h(P)
@@ -66,7 +60,7 @@ def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarra
         return np.asarray(np.trace(before_loss + (1 - fail) * received + recover * following_loss, axis1=1, axis2=2))
 
     result = total(following.mean(axis=1))  # linear in what was received, so that each run gives one value
-    return Simulated(float(result.mean()), float(result.std(ddof=1) / np.sqrt(len(result))))
+    return sampled(result)
 
 
 def over_patterns(example: Example, arrival: float, steps: int) -> np.ndarray:

@@ -162,7 +162,7 @@ def score(record: hg.Record, node: str, name: str) -> Score:
     seeds, _, n = errors.shape
     mean_square, claim = np.mean(errors**2, axis=0), np.diagonal(bound.mean(axis=0), axis1=1, axis2=2)
     bias = errors.mean(axis=0) ** 2 - errors.var(axis=0, ddof=1) / seeds
-    nees = np.einsum("kti,kti->kt", errors, np.linalg.solve(bound, errors[..., None])[..., 0]) / n
+    nees = hg.nees(errors, np.zeros_like(errors), bound) / n
     rmse, claimed, common, claimed_over_time = {}, {}, {}, {}
     for quantity, part in QUANTITIES.items():
         rmse[quantity] = _root_mean_square(UNITS[quantity] * np.sqrt(mean_square[:, part].sum(axis=1)))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import heliograph as hg
 from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION
-from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields
+from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields, sampled
 from heliograph_studies.curves import Curve, Panel, curves_over, paths
 
 SPEED, TURN = 1.0, 0.02  # m and rad a step
@@ -207,9 +207,7 @@ def driven(
 
 def nees_of(errors: np.ndarray, estimate: hg.model.Estimate) -> np.ndarray:
     """e' B^-1 e / n, (run, time)."""
-    weighed = np.linalg.solve(np.asarray(estimate.covariance), errors[..., None])[..., 0]
-    result: np.ndarray = np.sum(errors * weighed, axis=-1) / errors.shape[-1]
-    return result
+    return np.asarray(hg.nees(errors, np.zeros_like(errors), estimate.covariance) / errors.shape[-1])
 
 
 def score(errors: np.ndarray, nees: np.ndarray) -> Score:
@@ -221,7 +219,7 @@ def score(errors: np.ndarray, nees: np.ndarray) -> Score:
         median=float(np.median(place)),
         largest=float(place.max()),
         nees=float(nees.mean()),
-        nees_se=float(nees.mean(axis=1).std(ddof=1) / np.sqrt(runs)),
+        nees_se=sampled(nees.mean(axis=1)).error,
         inside=float(np.mean(np.abs(nees.mean(axis=0) - 1) <= reach)),
     )
 

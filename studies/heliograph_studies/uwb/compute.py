@@ -192,7 +192,7 @@ def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     # The place that a range is of lies before its stamp; the place at the stamp is predicted.
     error = off(read.time - numbers.late, place)
     ahead = place + numbers.late * np.gradient(place, np.maximum.accumulate(read.time), axis=0)
-    squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[used]), error)
+    squared = hg.nees(error, np.zeros_like(error), covariance[used])
     summaries = summarise_innovations(Weighed(innovation, variance, weight))
     return Rule(
         _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],
