@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from heliograph_studies import intermittent_observations
-from heliograph_studies.intermittent_observations import setting
+from heliograph_studies.intermittent_observations import setting, statements
 from heliograph_studies.intermittent_observations.mean_error import from_runs, iterate, mean_error, over_patterns
-from heliograph_studies.intermittent_observations.statements import statements
 from tests.riccati import riccati
 from tests.studies.readme import said_of
 

@@ -10,8 +10,7 @@ import heliograph as hg
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.wrappers.fed_back import prediction_of
 from heliograph.fusion.quantizer import Quantizer
-from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting
-from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
+from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting, ZoomQuantizer
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
 QUANTIZERS = "none", "dynamic", "static"

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph_studies.h_infinity_fusion.discriminating import relay_draws
 from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Runs
 from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
-from heliograph_studies.h_infinity_fusion.structured import relay_draws
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws, World, Worst, worst_disturbance
 
 MARGIN = 0.1  # of the box's width, added on each side

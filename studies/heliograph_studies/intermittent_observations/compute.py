@@ -11,6 +11,7 @@ import heliograph as hg
 from heliograph.linear import CriticalArrival
 from heliograph.random_affine import AbstractRandomAffine
 from heliograph.simulation import Boundedness
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.intermittent_observations.mean_error import (
     Iterated,
     Simulated,
@@ -28,8 +29,6 @@ from heliograph_studies.intermittent_observations.setting import (
     lossy,
     threshold,
 )
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
 
 APART = 0.005  # how far from a threshold verdicts are asked for
 

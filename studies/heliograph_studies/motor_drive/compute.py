@@ -9,13 +9,21 @@ import numpy as np
 from scipy import stats
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
-from heliograph_studies.motor_drive.drive import Drive, simulate_drive
+from heliograph_studies import Stages, Unlisted, check_fields
 from heliograph_studies.motor_drive.listeners import network, received
-from heliograph_studies.motor_drive.machine import RATED, ROTOR_RESISTANCE, STEP, Machine, draw_truth, euler, plant
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
+from heliograph_studies.motor_drive.machine import (
+    RATED,
+    ROTOR_RESISTANCE,
+    STEP,
+    Drive,
+    Machine,
+    draw_truth,
+    euler,
+    plant,
+    simulate_drive,
+)
 
 TRUSTS = {"stated": 1.0, "tenth": 10.0}  # process noise as stated, and a tenth of its deviations
 QUANTITIES = {"current": slice(0, 2), "flux": slice(2, 4), "speed": slice(4, 5)}
@@ -35,8 +43,7 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("seeds", self.seeds, 2)
-        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + self.seeds - 1)
+        check_fields(self, seeds=2)
         if not 0 <= self.dead_time < STEP:
             raise fail("dead_time", f"seconds, at least 0 and less than a step of {STEP:g}", self.dead_time)
         if not 0 < self.resistance < np.inf:

@@ -9,8 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.model.plant import AbstractPlant
-from heliograph.numerics.check import check_count
-from heliograph_studies.settings import NO_FILE, File
+from heliograph_studies import NO_FILE, File, check_fields
 
 HEIGHT = 1.0  # m, of the tag: the drives are flat
 SIZES = 1.3 ** np.arange(-2.0, 3.0)
@@ -83,7 +82,7 @@ class Setting:
     iterations: int = 6
 
     def __post_init__(self) -> None:
-        check_count("iterations", self.iterations, 0)
+        check_fields(self, iterations=0)
         object.__setattr__(self, "recording", File(self.recording))
 
 

@@ -19,13 +19,11 @@ from heliograph_studies.h_infinity_fusion import (
     growth,
     indices,
     levels,
-    numbers,
-    structured,
+    statements,
     worst_disturbance,
 )
-from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.compute import Parts
 from heliograph_studies.h_infinity_fusion.setting import NODES, Setting, dynamics
-from heliograph_studies.h_infinity_fusion.statements import statements
 from tests.studies.h_infinity_fusion.verdicts import VERDICTS
 from tests.studies.readme import said_of
 from tests.studies.verdicts import check_verdicts
@@ -90,7 +88,7 @@ def nodes():
 
 def test_every_certificate_passes_theorem_1_as_printed(nodes):
     for i, node in enumerate(nodes):
-        entries = numbers.certificate(node)
+        entries = compute.certificate(node)
         assert len(entries) == 16 and node.certificate.steps_certified == 16
         np.testing.assert_array_equal(entries[0]["P"], 10 * np.eye(4))
         assert np.linalg.eigvalsh(entries[0]["gamma"] ** 2 * 15 * np.eye(4) - entries[0]["P"])[0] > 0  # (19)
@@ -202,14 +200,16 @@ def result(nodes, outcome):
     finding = hg.h_infinity.check_growth(dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
     size = finding._replace(ratio=0.69, differences=False)
     filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_known"]
-    errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
+    errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in discriminating.SCENARIOS}
     over = {
-        s: {n: np.linspace(1, 2 + i, structured.STEPS) for i, n in enumerate(filters)} for s in structured.SCENARIOS
+        s: {n: np.linspace(1, 2 + i, discriminating.STEPS) for i, n in enumerate(filters)}
+        for s in discriminating.SCENARIOS
     }
     worst = {n: worst_disturbance.Worst(6.0 + i, 0.01, None) for i, n in enumerate(filters[:-1])}
-    designs = {n: {k: nodes[0].horizon for k in structured.OUTPUTS} for n in filters[:3]}
+    designs = {n: {k: nodes[0].horizon for k in discriminating.OUTPUTS} for n in filters[:3]}
     second = discriminating.Discriminating(
-        designs, {k: nodes[0].certificate for k in structured.OUTPUTS}, {k: 1.0 for k in structured.OUTPUTS}, 1.0, size,
+        designs, {k: nodes[0].certificate for k in discriminating.OUTPUTS},
+        dict.fromkeys(discriminating.OUTPUTS, 1.0), 1.0, size,
         errors, errors, over, worst, 100,
     )  # fmt: skip
     shown = outcome.record.estimates["fused"]
@@ -232,7 +232,7 @@ def result(nodes, outcome):
         levels.TrueGrowth(*np.full((3, 4, 2), 0.04), True),
         second,
     )
-    return compute.Outcome(numbers.numbers(parts), parts)
+    return compute.Outcome(compute.numbers(parts), parts)
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +275,9 @@ def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(folder / "record.nc", engine="h5netcdf") as record:
         assert record["gain"].shape == (4, 16, 2, 2)
-        assert record["second_mean_fused_error"].sel(filter="ekf_known", scenario="white").shape == (structured.STEPS,)
+        assert record["second_mean_fused_error"].sel(filter="ekf_known", scenario="white").shape == (
+            discriminating.STEPS,
+        )
     assert "true but empty" in (folder / "report.html").read_text()
     fits(folder / "report.html")
 

@@ -10,16 +10,16 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
 from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of, transitions
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of
 from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, stack
+from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
@@ -126,7 +126,8 @@ class Mesh(Module):
         `ahead` has weights that were computed before.
         """
         there = jnp.concatenate([self._rows(part) for part in z])[self.observation_model.order]
-        blocks, present = self.blocks(state.joint), ~jnp.isnan(there)
+        blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
+        present = ~jnp.isnan(there)
         messages = self._messages(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
@@ -225,13 +226,6 @@ class Mesh(Module):
         complete = jax.vmap(information_of)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
 
-    def blocks(self, joint: jax.Array | None) -> jax.Array | None:
-        """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
-        if joint is None:
-            return None
-        rows, columns = self.senders[:, :, None], self.senders[:, None]
-        return jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
-
     def _over_nodes(
         self,
         function: Callable[..., PyTree],
@@ -304,23 +298,13 @@ class Mesh(Module):
         return () if None in weights else tuple(filter(None, weights))
 
     def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
-        """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
-        gains, motion = parts.gains, parts.motion
-        nodes, n = len(self.senders), len(motion.shift)
-        m = self._spread(transitions(gains, motion.matrix))
-        k = self._spread(jnp.where(present[:, :, None, None], gains.gain[:, None], 0.0))
-        f = gains.innovation.reshape(nodes * n, n)
-        weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), parts.data.information).reshape(k.shape)
-        result = m @ joint.reshape(m.shape) @ m.T + f @ motion.noise @ f.T + weighted @ k.T
-        return symmetrize(result).reshape(nodes, n, nodes, n)
-
-    def _spread(self, blocks: Float[jax.Array, "node degree n n"]) -> Float[jax.Array, "N N"]:
-        """Matrix of all nodes with these blocks; padding adds nothing."""
-        nodes, _, n, _ = blocks.shape
-        held = jnp.where(jnp.asarray(self.edges.present)[:, :, None, None], blocks, 0.0)
-        rows = jnp.arange(nodes)[:, None]
-        empty = jnp.zeros((nodes, nodes, n, n))
-        return empty.at[rows, self.senders].add(held).swapaxes(1, 2).reshape(nodes * n, nodes * n)
+        """Joint covariance after a step."""
+        gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
+        measured = used(gains.gain, present)
+        m, ws, w = (spread(jnp.asarray(blocks), self.senders, self.edges.present) for blocks in (
+            transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured))  # fmt: skip
+        after = joint_after(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
+        return jnp.asarray(after).reshape(joint.shape)
 
     def _by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
         """Estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
@@ -372,7 +356,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         places=tuple(mine),
         nodes=graph.nodes,
         alpha=fusion.alpha,
-        quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
+        quantizer=fusion.uplinks(graph.nodes),
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],
     )
