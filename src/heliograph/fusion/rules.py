@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
-from heliograph.numerics.check import array, check_count, fail, instance, items, probabilities, scalar
+from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -337,8 +337,6 @@ class Fusion(Module):
     def check(self, nodes: Sequence[str], n: int) -> None:
         """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
         self.rule.check(len(nodes))
-        if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
-            raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
         for quantizer in self._quantizers(nodes):
             if not isinstance(first(quantizer), AbstractQuantizer):
                 raise fail("quantizer", "an AbstractQuantizer", type(quantizer).__name__)
@@ -358,8 +356,6 @@ class Fusion(Module):
     def _check_reports(self, nodes: Sequence[str], n: int) -> None:
         if not self.rule.uses_reports:
             raise fail("fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__)
-        if isinstance(self.uplink, Mapping) and set(self.uplink) != set(nodes):
-            raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
         for link in self.links(nodes):
             instance("report link", link, ReportLink, "a ReportLink").check(n)
         for quantizer in self._quantizers(nodes):
@@ -369,9 +365,7 @@ class Fusion(Module):
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""
-        if self.uplink is None:
-            return [ReportLink()] * len(nodes)
-        return [self.uplink[n] if isinstance(self.uplink, Mapping) else self.uplink for n in nodes]
+        return of_each("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
         """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
@@ -394,6 +388,4 @@ class Fusion(Module):
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
-        if self.quantizer is None:
-            return []
-        return [self.quantizer[n] if isinstance(self.quantizer, Mapping) else self.quantizer for n in nodes]
+        return [] if self.quantizer is None else of_each("quantizers", self.quantizer, nodes)

@@ -1,7 +1,7 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, cast
@@ -176,6 +176,15 @@ def table(name: str, value: object, what: str) -> dict[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise fail(name, f"a dictionary of {what} by name", shown(value))
     return dict(value)
+
+
+def of_each(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
+    """Return one value for each name, from a value for all of them or a dictionary of just these names."""
+    if not isinstance(value, Mapping):
+        return [value] * len(names)
+    if set(value) != set(names):
+        raise fail(name, f"one for each {whom} of {list(names)[:5]}", f"others: {sorted(set(value) ^ set(names))[:3]}")
+    return [value[item] for item in names]
 
 
 def instance(name: str, value: object, kind: type[T], what: str) -> T:

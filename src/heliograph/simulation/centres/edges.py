@@ -11,7 +11,7 @@ from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
-from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.check import array, fail, instance, of_each
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree
@@ -124,18 +124,18 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
     """
     if fusion.link is None:
         return Edges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
-    sender_receiver = graph.edges
-    names = [f"{graph.nodes[j]} to {graph.nodes[i]}" for j, i in sender_receiver]
-    if isinstance(fusion.link, Mapping) and set(fusion.link) != set(names):
-        wrong = sorted(set(fusion.link) ^ set(names))[:3]
-        raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
-    channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
-    several = isinstance(fusion.link, Mapping)
-    for name, channel in {id(c): (name, c) for name, c in zip(names, channels, strict=True)}.values():
-        check_edge(f"link {name!r}" if several else "link between neighbours", channel)
+    links = edge_links(fusion.link, graph)
+    for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
+        check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
-    groups, past = channel_groups(dict(zip(names, channels, strict=True))), max(first(c).past for c in channels)
-    return Edges(groups, slots, graph.present, fusion.rounds, past)
+    past = max(first(channel).past for channel in links.values())
+    return Edges(channel_groups(links), slots, graph.present, fusion.rounds, past)
+
+
+def edge_links(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
+    """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver."""
+    names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
+    return dict(zip(names, of_each("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True))
 
 
 def check_edge(what: str, link: Channel) -> None:

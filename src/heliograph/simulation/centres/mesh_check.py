@@ -1,7 +1,6 @@
 """Checks of a fusion between neighbours when its network is made, and its claim."""
 
 import warnings
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +15,11 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import fail, instance, of_each
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import arrival_chance, edges_of, loss_rate
+from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
 from heliograph.simulation.centres.mesh_decay import check_decay
 from heliograph.simulation.node import Node
 
@@ -118,8 +117,7 @@ def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph)
         raise fail(what, expected, "events" if fusion.rounds == 1 else f"{fusion.rounds} rounds")
     if fusion.quantizer is not None:
         fusion.check(graph.nodes, len(network.states))
-        several = fusion.quantizer.values() if isinstance(fusion.quantizer, Mapping) else [fusion.quantizer]
-        for item in several:
+        for item in of_each("quantizers", fusion.quantizer, graph.nodes):
             instance("quantizer between neighbours", item, UniformQuantizer, "one with a bound on its error whatever "
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
@@ -175,7 +173,7 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
         return
-    rates = [loss_rate(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link) for j, i in graph.edges]
+    rates = [loss_rate(channel) for channel in edge_links(link, graph).values()]
     if any(rate is None for rate in rates):
         return
     # Capacities -log p in whole units; those that are never cut get more than all others together.
@@ -246,8 +244,7 @@ def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) ->
         return
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(np.zeros(len(plant.inputs))))
     items = [network.nodes[name] for name in names]
-    rates = [arrival_chance(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link)
-             for j, i in graph.edges]  # fmt: skip
+    rates = [1.0] * len(graph.edges) if link is None else [arrival_chance(c) for c in edge_links(link, graph).values()]
     arrival = np.array([p for p in rates if p is not None])
     steady = all(_is_steady(item) for item in items if isinstance(item, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:

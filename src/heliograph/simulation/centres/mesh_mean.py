@@ -25,7 +25,7 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.edges import arrival_chance
+from heliograph.simulation.centres.edges import arrival_chance, edge_links
 from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
 from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
 from heliograph.simulation.network import Network
@@ -72,11 +72,12 @@ def mean_mesh_errors(
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
-    chances = [_known(item.link, f"{sender} to {names[i]}")
-               for i in range(len(names)) for sender in (item.neighbours or {})[names[i]]]  # fmt: skip
+    graph = graph_of(item.neighbours or {}, names)
+    links = {} if item.link is None else edge_links(item.link, graph)
+    chances = [_known(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
-    rule = item.rule.placed(graph_of(item.neighbours or {}, names))
+    rule = item.rule.placed(graph)
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
     part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
     rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
@@ -153,11 +154,10 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
-def _known(link: Channel | dict[str, Channel] | None, edge: str) -> float:
+def _known(edge: str, link: Channel) -> float:
     """Probability that a message of this edge arrives, at every step the same and drawn anew."""
-    channel = link[edge] if isinstance(link, dict) else link
-    chance = arrival_chance(channel)
+    chance = arrival_chance(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
-        raise fail(f"mean errors: link {edge!r}", expected, type(channel).__name__)
+        raise fail(f"mean errors: link {edge!r}", expected, type(link).__name__)
     return chance
