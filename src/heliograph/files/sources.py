@@ -215,11 +215,7 @@ class Sources:
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", shown(topic))
         sources = [items] if isinstance(items, Source) else items
-        if (
-            not isinstance(sources, Sequence)
-            or not all(isinstance(source, Source) for source in sources)
-            or not sources
-        ):
+        if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", shown(items))
         return [(source, self._places(f"sources, {topic!r}", source)) for source in sources]
 

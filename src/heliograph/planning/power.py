@@ -217,10 +217,8 @@ def _drawn_moments(
             return x, moments
 
         start = at(plant, 0).sample_initial(begin)
-        moments_over_time: dict[str, jax.Array] = jax.lax.scan(
-            step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs))
-        )[1]
-        return moments_over_time
+        over_time: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+        return over_time
 
     runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
     return jax.tree.map(lambda moments: moments.mean(axis=1), runs)  # type: ignore[no-any-return]

@@ -355,20 +355,16 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
 
 
 def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    propagated, n = steady(steps, gains), steps.transition.shape[-1]
-    last = propagated.moments[1:, -n:, -n:]
-    return (
-        jnp.trace(last, axis1=1, axis2=2),
-        is_covariance(propagated.moments),
-        jnp.sum(propagated.power[:, 1:], axis=1),
-    )
+    end, n = steady(steps, gains), steps.transition.shape[-1]
+    last = end.moments[1:, -n:, -n:]
+    return jnp.trace(last, axis1=1, axis2=2), is_covariance(end.moments), jnp.sum(end.power[:, 1:], axis=1)
 
 
 def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    propagated, n = steady(steps, gains), steps.transition.shape[-1]
+    end, n = steady(steps, gains), steps.transition.shape[-1]
     spread = steady_behind(steps, gains)
-    sound = is_covariance(propagated.moments[:, :-n, :-n]) & is_covariance(spread)
-    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(propagated.power[:, 1:], axis=1)
+    sound = is_covariance(end.moments[:, :-n, :-n]) & is_covariance(spread)
+    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(end.power[:, 1:], axis=1)
 
 
 _receiver_cost = _value(_receiver_traces)

@@ -257,11 +257,7 @@ def _plan(
         return planned_with_past(filter, u) if smooths else filter.planned(u)
 
     planned = tuple(
-        replace(
-            stacked,
-            filters=over_all(partial(single, smooths=stacked.smooths), stacked.count * stacked.nodes)(stacked.filters),
-        )
-        for stacked in alike
+        replace(a, filters=over_all(partial(single, smooths=a.smooths), a.count * a.nodes)(a.filters)) for a in alike
     )
     return planned, {name: single(filter, smooths) for name, filter in central.items()}
 

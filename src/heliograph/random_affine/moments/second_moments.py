@@ -342,10 +342,8 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
-        QuadraticMap(
-            sum(q.center for q in quadratics) + apart * center, sum(q.radius for q in quadratics) + apart * radius
-        )
-        for quadratics, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+        QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
+        for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
 
 
