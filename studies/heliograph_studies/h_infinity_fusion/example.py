@@ -10,6 +10,7 @@ import heliograph as hg
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.wrappers.fed_back import prediction_of
 from heliograph.fusion.quantizer import Quantizer
+from heliograph_studies import sampled
 from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting, ZoomQuantizer
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
@@ -53,7 +54,7 @@ class Runs:
 
     def mean_error(self, name: str, quantizer: str) -> "Mean":
         """Mean norm of the fused error over runs and steps, and its standard error."""
-        return mean_and_error(self.errors(name, quantizer).mean(axis=1))
+        return Mean(*sampled(self.errors(name, quantizer).mean(axis=1)))
 
     def estimates(self, name: str) -> np.ndarray:
         """Local estimates (run, node, time, n)."""
@@ -74,11 +75,6 @@ class Mean(NamedTuple):
 
 
 Designs = Mapping[str, list[hg.h_infinity.HInfinityDesign]]  # by name, one for each node
-
-
-def mean_and_error(values: np.ndarray) -> Mean:
-    """Mean of independent values (run,) and its standard error."""
-    return Mean(float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))))
 
 
 def fused_name(name: str, quantizer: str) -> str:

@@ -6,10 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies.h_infinity_fusion.discriminating import relay_draws
 from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Runs
 from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
-from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws, World, Worst, worst_disturbance
+from heliograph_studies.h_infinity_fusion.worst_disturbance import World, Worst, worst_disturbance
 
 MARGIN = 0.1  # of the box's width, added on each side
 ENERGIES = (5e4, 1e5, 2e5)  # starts of some 60, where the cosine of f changes its sign
@@ -65,13 +64,8 @@ def violation(setting: Setting, node: int, design: hg.h_infinity.HInfinityDesign
     """The worst disturbance found for a node's filter; where its level is above the design's, the theorem is broken."""
     believed, sensor = setting.plant(False), setting.sensor(node, 0.0)
     item = hg.filters.h_infinity_filter(believed, sensor, setting.system(node), design)
-    judges = draws(setting, SEARCH_DRAWS, 1), draws(setting, JUDGE_DRAWS, 2)
+    judges = setting.draws(SEARCH_DRAWS, 1), setting.draws(JUDGE_DRAWS, 2)
     return worst_disturbance(item, world(setting, node), *judges, ENERGIES, starts=16)
-
-
-def draws(setting: Setting, count: int, seed: int) -> Draws:
-    """Arrivals of `count` runs as gains."""
-    return relay_draws(setting.arrival, setting.noise_gain, setting.powers, setting.steps, count, seed)
 
 
 def world(setting: Setting, node: int) -> World:

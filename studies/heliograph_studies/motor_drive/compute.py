@@ -162,7 +162,7 @@ def score(record: hg.Record, node: str, name: str) -> Score:
     seeds, _, n = errors.shape
     mean_square, claim = np.mean(errors**2, axis=0), np.diagonal(bound.mean(axis=0), axis1=1, axis2=2)
     bias = errors.mean(axis=0) ** 2 - errors.var(axis=0, ddof=1) / seeds
-    nees = np.einsum("kti,kti->kt", errors, np.linalg.solve(bound, errors[..., None])[..., 0]) / n
+    nees = hg.nees(errors, np.zeros_like(errors), bound) / n
     rmse, claimed, common, claimed_over_time = {}, {}, {}, {}
     for quantity, part in QUANTITIES.items():
         rmse[quantity] = _root_mean_square(UNITS[quantity] * np.sqrt(mean_square[:, part].sum(axis=1)))
@@ -170,19 +170,15 @@ def score(record: hg.Record, node: str, name: str) -> Score:
         claimed[quantity] = _root_mean_square(claimed_over_time[quantity])
         common[quantity] = float(bias[:, part].sum() / mean_square[:, part].sum())
     ratio = {quantity: rmse[quantity] / claimed[quantity] for quantity in QUANTITIES}
-    mean = _mean_and_interval(nees.mean(axis=1))
-    return Score(rmse, claimed, ratio, common, mean, claimed_over_time, nees.mean(axis=0))
+    # The mean over independent seeds, and its 95 % interval by Student's law.
+    of_seed = nees.mean(axis=1)
+    mean, width = of_seed.mean(), stats.t.ppf(0.975, seeds - 1) * of_seed.std(ddof=1) / np.sqrt(seeds)
+    interval = {"mean": float(mean), "low": float(mean - width), "high": float(mean + width)}
+    return Score(rmse, claimed, ratio, common, interval, claimed_over_time, nees.mean(axis=0))
 
 
 def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _mean_and_interval(values: np.ndarray) -> dict[str, float]:
-    """Mean of independent values and its 95 % interval by Student's law."""
-    mean, seeds = float(values.mean()), len(values)
-    width = float(stats.t.ppf(0.975, seeds - 1) * values.std(ddof=1) / np.sqrt(seeds))
-    return {"mean": mean, "low": mean - width, "high": mean + width}
 
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
