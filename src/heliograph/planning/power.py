@@ -81,8 +81,8 @@ def power(
         network: the network.
         horizon: number of steps from the plant's initial law on; the steady state of a linear plant unless given.
         inputs: inputs of the plant, (horizon, inputs); zero unless given.
-        runs: number of drawn trajectories, where plant or sensors are not linear.
-        seed: of the draws.
+        runs: number of drawn trajectories, where plant or sensors are not linear (default 1000).
+        seed: of the draws (default 0).
 
     Returns:
         The powers, with standard errors where they are drawn.

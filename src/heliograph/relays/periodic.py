@@ -52,6 +52,9 @@ def periodic_steps(network: RelayNetwork) -> Steps:
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
 
+    Args:
+        network: relays that filter, in slots that repeat.
+
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
@@ -65,6 +68,10 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """Return the steady state of a `network` under given gains, one entry per slot: {filter: (slots, n, received)}.
 
     The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
+
+    Args:
+        network: relays that filter, in slots that repeat.
+        gains: K by filter, (slots, n, received).
 
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.

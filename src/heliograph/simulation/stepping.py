@@ -290,6 +290,10 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
     the bound on its error. Claim: as the fusion's.
 
+    Args:
+        network: the network.
+        name: of its fusion.
+
     Raises:
         ValueError: no fusion of this name, or one by another rule.
 

@@ -205,6 +205,9 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
     probabilities have their maxima.
 
+    Args:
+        channel: one that forgets.
+
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """

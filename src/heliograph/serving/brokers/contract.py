@@ -37,8 +37,8 @@ def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0)
 
     Args:
         broker: both sides of the broker to examine.
-        messages: number of messages sent in each part of the check.
-        patience: seconds that a single call may take at most.
+        messages: number of messages sent in each part of the check (default 100).
+        patience: seconds that a single call may take at most (default 20).
 
     Returns:
         Whether redelivered messages arrive in order. If not, the window of a service has to be longer than a redelivery
