@@ -197,11 +197,7 @@ class Lanes:
             for name, (kind, f, i) in self.network.places().items()
             if outcome["weighed"][kind] is not None
         }
-        central = {
-            (FUSED, name): list(columns)
-            for name, columns in outcome["weighed_centrally"].items()
-            if columns is not None
-        }
+        central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
         return {
             name: WeighedAt(*(tuple(map(int, field)) for field in columns))
             for name, columns in (parts | central).items()

@@ -93,6 +93,7 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
 
 def _tests_table(health: Health) -> Table:
     """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
+    # One row for each filter.
     rows = []
     for judged in _fused_first(health.filters):
         numbers = ["–", "–", "–"]
@@ -103,6 +104,7 @@ def _tests_table(health: Health) -> Table:
                 "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}",
             ]
         rows.append([visible(f"{judged.node}/{judged.filter}"), judged.claim, *numbers])
+    # What the columns are, in words.
     caption = (
         "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
         "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "

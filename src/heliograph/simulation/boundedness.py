@@ -79,6 +79,9 @@ def certify_boundedness(network: Network) -> Boundedness:
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
 
+    Args:
+        network: linear, of nodes that receive their sensors over channels that do not vary.
+
     Raises:
         ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late, relays that
             filter, too many sets of losses.

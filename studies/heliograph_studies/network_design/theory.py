@@ -12,8 +12,8 @@ ways to vary a path's power over time.
 
 Relays on a line: over the whole way a hop has the noise rho, in units of the total power; over a part d of it rho d^e.
 With shares q of the power the noise of the path is s K F - t with F = prod_h (1 + rho d_h^e / q_h) and K = kappa^hops.
-Where lengths and shares are best together, d F / d d_h and d F / d q_h are each the same for all hops, and so d_h / q_h
-is: q = d, and
+Where lengths and shares are best together, d F / d d_h and d F / d q_h are each the same for all hops, and so d_h /
+q_h is: q = d, and
   log F = sum_h log(1 + rho d_h^(e - 1)),   sum_h d_h = 1.
 Each term is convex in d up to a length and concave beyond, so at the least at most one hop is of the longer kind: all
 hops are equal, or all but one. That leaves a function of one number, which is searched.
