@@ -8,7 +8,10 @@ from heliograph_studies.markdown import stated
 from heliograph_studies.outcome import Inline, Unlisted
 from heliograph_studies.settings import NO_FILE, File, check_fields
 from heliograph_studies.stages import Stages
-from heliograph_studies.statement import Sampled, Statement
+from heliograph_studies.statement import Sampled, Statement, sampled
 from heliograph_studies.study import Study
 
-__all__ = ["NO_FILE", "File", "Inline", "Sampled", "Stages", "Statement", "Study", "Unlisted", "check_fields", "stated"]
+__all__ = [
+    "NO_FILE", "File", "Inline", "Sampled", "Stages", "Statement",
+    "Study", "Unlisted", "check_fields", "sampled", "stated",
+]  # fmt: skip

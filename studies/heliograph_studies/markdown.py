@@ -156,7 +156,8 @@ def _add(
     elif node.type == "table":
         blocks.append(_table(node))
     elif node.type == "fence" and node.info == "keys":
-        blocks.append(KeyFigures([_key_figure(line) for line in node.content.splitlines()]))
+        rows = [[part.strip() for part in line.split("|")] for line in node.content.splitlines()]
+        blocks.append(KeyFigures([KeyFigure(label, value, note, colour) for colour, label, value, note in rows]))
     elif node.type == "fence" and node.info == "statements":
         blocks += verdicts([statement for name in node.content.split() for statement in statements[name]])
     elif node.type == "fence":
@@ -172,11 +173,6 @@ def _add(
 def _text(node: SyntaxTreeNode) -> str:
     """What is written in a paragraph, heading or cell, in one line."""
     return " ".join(child.content for child in node.children).replace("\n", " ").strip()
-
-
-def _key_figure(line: str) -> KeyFigure:
-    colour, label, value, note = (part.strip() for part in line.split("|"))
-    return KeyFigure(label, value, note, colour)
 
 
 def _table(node: SyntaxTreeNode) -> Table:

@@ -29,6 +29,11 @@ class Sampled(NamedTuple):
         return self.value - limit < -SIGNIFICANT * self.error
 
 
+def sampled(values: np.ndarray) -> Sampled:
+    """The mean of independent values, (run,), and its standard error."""
+    return Sampled(float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))))
+
+
 Evidence: TypeAlias = Mapping[str, "float | Sampled"]
 
 

@@ -32,27 +32,8 @@ WIDTH, KEYS = 80, 4  # of what is printed; key figures in it
 REPEATED = ("runs", "seed")  # what tells two runs of one study apart, not two studies
 
 
-def no_statements(_: object) -> Judged:
-    """Of an example, which nobody stated anything about."""
-    return {}
-
-
-def no_words(_: object) -> Mapping[str, object]:
-    """The page puts in what is there without."""
-    return {}
-
-
 def no_progress(what: str, done: int = 0, total: int = 0) -> None:
     """Of work that has not begun."""
-
-
-def no_files(_: object) -> Sequence[Path]:
-    """Settings alone say what is worked out."""
-    return ()
-
-
-def no_data(_: object, __: Path) -> None:
-    """All numbers are in the summary."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +55,12 @@ class Study(Generic[Setting, Outcome]):
     compute: Callable[[Setting, Stages], Outcome]
     stages: int
     figures: "Callable[[Outcome], Mapping[str, Figure]]"
-    words: Callable[[Outcome], Mapping[str, object]] = no_words
+    words: Callable[[Outcome], Mapping[str, object]] = lambda _: {}
     publication: str = ""
-    statements: Callable[[Outcome], Judged] = no_statements
-    data: Callable[[Outcome, Path], None] = no_data
+    statements: Callable[[Outcome], Judged] = lambda _: {}
+    data: Callable[[Outcome, Path], None] = lambda _, __: None
     needs: Sequence[str] = ()
-    files: Callable[[Setting], Sequence[Path]] = no_files
+    files: Callable[[Setting], Sequence[Path]] = lambda _: ()
     page: str = "page.md"
 
     def settings(self, values: Mapping[str, str]) -> Setting:

@@ -30,6 +30,9 @@ def load_campaign(path: str | Path) -> Campaign:
     truth and measurements too), [inputs] name = a number or one for each step, timeout (seconds that a worker may take
     to build a setting or compute a chunk, 3600).
 
+    Args:
+        path: of the TOML file.
+
     Raises:
         ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
             network's function does not take.

@@ -75,9 +75,9 @@ def run_campaign(
         campaign: the campaign, from `load_campaign`.
         out: the results folder.
         workers: number of worker processes, by default one for each CPU; 0 computes in this process.
-        scheduler: address of a Dask scheduler, used instead of worker processes.
+        scheduler: address of a Dask scheduler, used instead of worker processes (default none).
         only: (setting, chunk) pairs to compute; by default all.
-        progress: called as progress(what, done, total) to report progress.
+        progress: called as progress(what, done, total) to report progress (default none).
 
     Raises:
         ValueError: a folder of something else or of another campaign, or one in use; a setting or chunk that does not

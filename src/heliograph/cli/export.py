@@ -42,14 +42,12 @@ def export(
     check_place(out)
     loaded = load_network(network)
     chosen = node_of(loaded, filter, node)
-    loaded_filter = loaded.nodes[chosen].filters[filter]
-    names = loaded.nodes[chosen].received_names[: loaded_filter.received]
+    subject = loaded.nodes[chosen].filters[filter]
+    names = loaded.nodes[chosen].received_names[: subject.received]
     # Write the files, then compile and time them.
-    written = export_named(loaded_filter, out, precision, names)
-    measured = cost(
-        written.header, written.source, loaded_filter.received, len(loaded_filter.inputs), PRECISIONS[precision]
-    )
-    claim = claim_of(loaded_filter, PRECISIONS[precision])
+    written = export_named(subject, out, precision, names)
+    measured = cost(written.header, written.source, subject.received, len(subject.inputs), PRECISIONS[precision])
+    claim = claim_of(subject, PRECISIONS[precision])
     print(visible(f"{written.header}, {written.source}: {chosen}/{filter} ({claim}), {precision} precision"))
     print("\n".join(costs(written, measured)))
 

@@ -131,20 +131,16 @@ def products_of(items: Iterable[Any]) -> set[Node]:
     return results
 
 
-def uses(statement: Any) -> list[Node]:
+def uses(node: Any) -> list[Node]:
     """Return the nodes that an item of a program uses directly."""
-    if isinstance(statement, Node):
-        return list(statement.args)
-    if isinstance(statement, Store):
-        return [statement.node, *statement.indices]
-    if isinstance(statement, Guard):
-        return [statement.condition, *statement.values]
-    if isinstance(statement, Loop):
-        return [
-            *statement.initial,
-            *statement.following,
-            *([] if statement.condition is None else [statement.condition]),
-        ]
+    if isinstance(node, Node):
+        return list(node.args)
+    if isinstance(node, Store):
+        return [node.node, *node.indices]
+    if isinstance(node, Guard):
+        return [node.condition, *node.values]
+    if isinstance(node, Loop):
+        return [*node.initial, *node.following, *([] if node.condition is None else [node.condition])]
     return []
 
 

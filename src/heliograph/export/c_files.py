@@ -44,7 +44,8 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
         filter: the filter.
         path: path of the source, which ends in .c; the header is written next to it.
         precision: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as L
-            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains.
+            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains
+            (default "double").
 
     Returns:
         The two files, the number of each operation in a step, and the bytes of the state.

@@ -134,12 +134,10 @@ class Decoder:
         except LayoutError:
             return False
         for node, parts in readings.items():
-            rows = np.concatenate([reading.rows for reading in parts])
+            rows = np.concatenate([block.rows for block in parts])
             order = np.argsort(rows, kind="stable")
             logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
-            joined = (
-                np.concatenate([getattr(reading, name) for reading in parts])[order] for name in Readings._fields[1:]
-            )
+            joined = (np.concatenate([getattr(block, name) for block in parts])[order] for name in Readings._fields[1:])
             table.add_many(node, logged, *joined)
         return True
 

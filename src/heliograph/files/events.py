@@ -185,6 +185,7 @@ def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndar
     """Return times and arrivals as numbers, and the date that they are counted from if they were dates."""
     parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
     first = columns[TIME][0]
+    # Dates, as seconds from the first of them.
     if hasattr(first, "isoformat") or looks_like_date(str(first)):
         results = [dates(columns[column], f"{path}, column {column!r}") for column in parts]
         for column, values in zip(parts, results, strict=True):
@@ -192,11 +193,10 @@ def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndar
         origin: np.datetime64 = results[0].min()
         seconds = [(values - origin).astype(np.int64) / 1e9 for values in results]  # exact before they are floats
         return seconds[0], seconds[-1], origin
+    # Numbers as they are.
     numbers = [
-        np.array(
-            [_number(cell, f"{path}, row {row}, column {column!r}") for row, cell in enumerate(columns[column], 1)]
-        )
-        for column in parts
+        np.array([_number(cell, f"{path}, row {row}, column {name!r}") for row, cell in enumerate(columns[name], 1)])
+        for name in parts
     ]
     return numbers[0], numbers[-1], None
 

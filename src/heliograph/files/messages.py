@@ -29,7 +29,7 @@ def read_messages(path: str | Path, network: Network, sources: object, progress:
         path: the bag or the file.
         network: the network.
         sources: sources by topic, as `json_field` makes them.
-        progress: called with the numbers of messages read and to be read.
+        progress: called with the numbers of messages read and to be read (default none).
 
     Raises:
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.

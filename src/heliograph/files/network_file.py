@@ -38,22 +38,23 @@ def load_network(reference: str) -> Network:
 def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
     """Load a network as `load_network` does, and whatever else its module names, such as `sources` and `pose`."""
     file_path("network", reference)
-    module_name, _, name = str(reference).rpartition(":")
-    if not module_name or not name.isidentifier():  # no name, or the colon of a drive letter
-        module_name, name = reference, ""
-    if module_name.endswith(".py") or os.sep in module_name or Path(module_name).is_file():
-        path = Path(module_name)
+    source_name, _, name = str(reference).rpartition(":")
+    if not source_name or not name.isidentifier():  # no name, or the colon of a drive letter
+        source_name, name = reference, ""
+    # A file, by its path.
+    if source_name.endswith(".py") or os.sep in source_name or Path(source_name).is_file():
+        path = Path(source_name)
         if not path.is_file():
-            raise fail(
-                f"network {module_name}", "a Python file", "a folder" if path.is_dir() else "nothing of that name"
-            )
+            got = "a folder" if path.is_dir() else "nothing of that name"
+            raise fail(f"network {source_name}", "a Python file", got)
         with _importing_from(path.parent):
-            module = _guarded(lambda: _run_file(path), module_name, path)
-            return _pick(module, name, module_name, path), vars(module)
+            module = _guarded(lambda: _run_file(path), source_name, path)
+            return _pick(module, name, source_name, path), vars(module)
+    # A module, by its name.
     with _importing_from(Path.cwd()):
-        source = _guarded(lambda: _source(module_name), module_name, None)
-        module = _guarded(lambda: importlib.import_module(module_name), module_name, source)
-        return _pick(module, name, module_name, source), vars(module)
+        source = _guarded(lambda: _source(source_name), source_name, None)
+        module = _guarded(lambda: importlib.import_module(source_name), source_name, source)
+        return _pick(module, name, source_name, source), vars(module)
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
@@ -86,33 +87,29 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     return build
 
 
-def _pick(module: ModuleType, name: str, reference: str, path: Path | None) -> Network:
+def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
-        return _named(module, name, reference, path, networks)
+        return _named(module, name, file, path, networks)
     if len({id(network) for network in networks.values()}) == 1:
         return next(iter(networks.values()))
     if networks:
-        choices = " or ".join(f"{reference}:{key}" for key in networks)
-        raise fail(f"network {reference}", f"a name, as {choices}", f"none, and {len(networks)} networks")
-    raise fail(
-        f"network {reference}", f"a heliograph.Network (or {reference}:FUNCTION that returns one)", "none in the module"
-    )
+        choices = " or ".join(f"{file}:{key}" for key in networks)
+        raise fail(f"network {file}", f"a name, as {choices}", f"none, and {len(networks)} networks")
+    raise fail(f"network {file}", f"a heliograph.Network (or {file}:FUNCTION that returns one)", "none in the module")
 
 
-def _named(module: ModuleType, name: str, reference: str, path: Path | None, networks: dict[str, Network]) -> Network:
+def _named(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
         holds = ", ".join(networks) or "no networks"
         hint = f" (closest: {close[0]!r})" if close else ""
-        raise fail(
-            f"network {reference}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}"
-        )
+        raise fail(f"network {file}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}")
     value = getattr(module, name)
     if callable(value) and not isinstance(value, Network):
-        value = _guarded(value, f"{reference}:{name}", path)
+        value = _guarded(value, f"{file}:{name}", path)
     if not isinstance(value, Network):
-        raise fail(f"network {reference}:{name}", "a heliograph.Network", type(value).__name__)
+        raise fail(f"network {file}:{name}", "a heliograph.Network", type(value).__name__)
     return value
 
 

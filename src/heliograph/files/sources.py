@@ -92,10 +92,10 @@ def json_field(
         path: dotted path of the value, or of several, which are then one measurement.
         node: name of a node of the network, or "inputs".
         output: name of the output or input, one for each path; None for all of the node's, in their order.
-        scale: factor, of all values or of each. Shape () or (values,).
-        offset: added after scaling, to all values or to each. Shape () or (values,).
+        scale: factor, of all values or of each. Shape () or (values,) (default 1).
+        offset: added after scaling, to all values or to each. Shape () or (values,) (default 0).
         time: dotted path of the time; None for the moment of arrival.
-        time_unit: unit of a time that is a number.
+        time_unit: unit of a time that is a number (default "s").
         sequence: dotted path of the node's running count; None if there is none.
         plant: dotted path of the plant's name; None if there is one plant.
         step: seconds of a step of a network that counts steps, where times are dates; None for any other.
@@ -215,11 +215,7 @@ class Sources:
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", shown(topic))
         sources = [items] if isinstance(items, Source) else items
-        if (
-            not isinstance(sources, Sequence)
-            or not all(isinstance(source, Source) for source in sources)
-            or not sources
-        ):
+        if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", shown(items))
         return [(source, self._places(f"sources, {topic!r}", source)) for source in sources]
 

@@ -58,9 +58,7 @@ def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
     some = next((value for value in column if value is not None), None)
     if isinstance(some, str) or hasattr(some, "isoformat"):
         return dates(column, name)
-    texts = [
-        value for value in column if isinstance(value, str | bytes)
-    ]  # text is no number, though it may read as one
+    texts = [x for x in column if isinstance(x, str | bytes)]  # text is no number, though it may read as one
     try:
         if texts:
             raise TypeError

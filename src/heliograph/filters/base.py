@@ -241,12 +241,20 @@ def _step_with_smoother(
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it."""
+    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it.
+
+    Args:
+        predict: the method of a filter, which gets arrays of the filter's sizes.
+    """
     return _checked(predict, given)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it."""
+    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it.
+
+    Args:
+        correct: the method of a filter, which gets arrays of the filter's sizes.
+    """
     return _checked(correct, measured)
 
 

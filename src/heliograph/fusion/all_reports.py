@@ -176,13 +176,10 @@ def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     errors = happened.errors
     mean = errors.mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
-    second = (
-        errors.covariance
-        - errors.with_state
-        - jnp.swapaxes(errors.with_state, 1, 2)
-        + blocks
-        + mean[:, :, None] * mean[:, None]
-    )
+    # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
+    both = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
+    second = errors.covariance - both + blocks + mean[:, :, None] * mean[:, None]
+    # Noise of the reports: the spread of the links on what is sent, and the quantizers' error.
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))

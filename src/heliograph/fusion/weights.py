@@ -41,6 +41,9 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
     given. D is the mean of the estimates' variances, so units do not matter; one rank rule, on correlations.
 
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+
     Source: Rao, Linear Statistical Inference and its Applications (1973), 4i.4, the unified theory of least squares.
     """
     nodes, n = joint.shape[:2]
@@ -86,7 +89,11 @@ def factored_weights(
 @_of_joint
 @compiled
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n)."""
+    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
+
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+    """
     nodes, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", jnp.asarray(joint))
     weights = jax.vmap(lambda block: matrix_weights(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
@@ -96,7 +103,11 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
 @_of_joint
 @compiled
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n)."""
+    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
+
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+    """
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
     by_node = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
@@ -114,6 +125,9 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
     linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
 
+    Args:
+        levels: gamma_i of the nodes (N,), positive.
+
     Raises:
         ValueError: levels that are not positive.
 
@@ -129,6 +143,10 @@ def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"])
 
     The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
     the gamma_i, `weights` (N,) the c_i.
+
+    Args:
+        levels: gamma_i of the nodes (N,), positive.
+        weights: c_i (N,), not negative, of sum 1.
 
     Raises:
         ValueError: levels that are not positive, weights off the simplex or not as many.

@@ -72,7 +72,7 @@ def certify_level(
         weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
         multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~.
         level: gamma, a positive ratio of norms.
-        growth: results of `check_growth`; constants that none of them proves are listed as assumed.
+        growth: results of `check_growth`; constants that none of them proves are listed as assumed (default none).
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.

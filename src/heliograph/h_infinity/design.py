@@ -87,10 +87,11 @@ def recursive_design(
         initial: P_0 (2n, 2n); the largest allowed, level^2 W, by default.
         objective: which P_s+1 to take: "trace" the smallest tr L (this and the next in coordinates of order one where
             no growth makes lengths comparable), "largest_eigenvalue" that of L and among those the smallest tr L,
-            "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end.
-        solver: "clarabel" (interior point) or "scs" (first order).
-        separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative.
-        search: look for the smallest level if the given one fails.
+            "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end (default
+            "trace").
+        solver: "clarabel" (interior point) or "scs" (first order) (default "clarabel").
+        separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative (default False).
+        search: look for the smallest level if the given one fails (default True).
 
     Raises:
         ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape,
@@ -131,10 +132,10 @@ def horizon_design(
 
     Args:
         system: the system, from `growth_system`.
-        separate: one multiplier for each of f, f~, h, h~ in place of two; never worse.
+        separate: one multiplier for each of f, f~, h, h~ in place of two; never worse (default False).
         gains: K (steps, n, m), to find the smallest level that can be proven for these; free by default.
         initial: P_0 (2n, 2n); by default the largest allowed, level^2 W, which is never worse than another.
-        solver: "clarabel" or "scs".
+        solver: "clarabel" or "scs" (default "clarabel").
 
     Raises:
         ValueError: an unknown solver, gains or an initial weight of the wrong shape.

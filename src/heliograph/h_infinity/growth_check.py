@@ -130,7 +130,7 @@ def check_growth(
         name: the function's name in sentences; "f" by default.
         seed: seed of the search; 0 by default.
         differences: False for the weaker condition on f itself, |f(x)| <= a |x|: pairs with 0, which has to be in the
-            box.
+            box (default True).
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.

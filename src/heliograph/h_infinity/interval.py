@@ -51,9 +51,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
             results = evaluate(inner, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:
             results = [_square(inputs[0])]
-        elif name in MOVES or all(
-            argument.low.dtype.kind in "iu" for argument in inputs
-        ):  # whole numbers are not rounded
+        elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
             results = _moved(equation, inputs)
         else:
             results = [_operation(equation, inputs, continuous)]
@@ -123,13 +121,9 @@ def _decided(interval: Interval, continuous: bool) -> Interval:
 
 def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
     """Intervals of numbers that only change places: move the low ends, and the high ends; places are whole numbers."""
-    if any(argument.low.dtype.kind in "iu" and not np.array_equal(argument.low, argument.high) for argument in x):
+    if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise UnknownError("a place that depends on x")
-    pairs = zip(
-        _bound(equation, [argument.low for argument in x]),
-        _bound(equation, [argument.high for argument in x]),
-        strict=True,
-    )
+    pairs = zip(_bound(equation, [a.low for a in x]), _bound(equation, [a.high for a in x]), strict=True)
     return [Interval(*pair) for pair in pairs]
 
 

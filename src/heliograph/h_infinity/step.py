@@ -290,14 +290,7 @@ def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"
     """Scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor(x), _factor(e)))
-    return np.diag(
-        np.concatenate(
-            [
-                _nonzero(np.full(len(covariance), np.sqrt(np.trace(covariance) / len(covariance))))
-                for covariance in (x, e)
-            ]
-        )
-    )
+    return np.diag(np.concatenate([_nonzero(np.full(len(s), np.sqrt(np.trace(s) / len(s)))) for s in (x, e)]))
 
 
 def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -317,17 +310,15 @@ def _nonzero(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 def _signals(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
     n, y, q = system.states, system.output.shape[1], len(step.energy)
-    covariance, at = np.zeros((q, q)), 2 * n
-    covariance[:n, :n], covariance[n:at, n:at] = x, e
+    total, at = np.zeros((q, q)), 2 * n
+    total[:n, :n], total[n:at, n:at] = x, e
     for growth, width in ((system.growth, n), (system.output_growth, y)):
         if not growth.absent:
-            for constant, argument in ((growth.state[k], x), (growth.error[k], e)):
-                covariance[at : at + width, at : at + width] = (
-                    constant**2 * np.linalg.eigvalsh(argument)[-1] * np.eye(width)
-                )
+            for constant, p in ((growth.state[k], x), (growth.error[k], e)):
+                total[at : at + width, at : at + width] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
                 at += width
-    covariance[at:, at:] = np.eye(q - at)
-    return covariance
+    total[at:, at:] = np.eye(q - at)
+    return total
 
 
 def _moved(

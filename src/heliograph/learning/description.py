@@ -150,9 +150,7 @@ class Given:
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
         self.values = values
-        self.unnamed = iter(
-            [parameter.name for parameter, single in zip(parameters.every, named, strict=True) if not single]
-        )
+        self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value."""

@@ -154,12 +154,13 @@ def fit(
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
             one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
-        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ.
-        starts: number of starts: the given one, and others drawn around it.
-        seed: seed of the starts that are drawn.
-        progress: called with a line of text at each step.
-        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True
-            takes those that the recordings hold.
+        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
+            none).
+        starts: number of starts: the given one, and others drawn around it (default 6).
+        seed: seed of the starts that are drawn (default 0).
+        progress: called with a line of text at each step (default none).
+        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True takes
+            those that the recordings hold (default False).
 
     Raises:
         ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit

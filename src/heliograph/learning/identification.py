@@ -71,9 +71,9 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
-        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs.
+        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs (default none).
         horizon: number of steps of the data, where there are no inputs; 400 by default.
-        seed: seed of the data and of the points.
+        seed: seed of the data and of the points (default 0).
 
     Raises:
         ValueError: as `fit`.

@@ -61,8 +61,8 @@ def samples_to_tell(
         network: a network of one node that receives its sensor through a channel.
         inputs: inputs of the plant (steps, inputs); their length is that of the runs, 500 steps unless given.
         error: probability of either wrong decision, in (0, 0.5); 0.05 by default.
-        seed: seed of the simulation.
-        nodes: number of values that stand for each law.
+        seed: seed of the simulation (default 0).
+        nodes: number of values that stand for each law (default 64).
 
     Raises:
         ValueError: a network with several nodes or none that receives through a channel, no gain to put the laws in, an

@@ -71,6 +71,10 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
     "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
 
+    Args:
+        system: whose state y is estimated from its measurements z.
+        claim: of the schedule (default "exact").
+
     Raises:
         ValueError: an unknown claim.
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
@@ -142,6 +146,10 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     """E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
 
     Joint moments of (y, s) are propagated; nothing is assumed of the gains.
+
+    Args:
+        system: the world.
+        schedule: gains for as many steps and measurements.
 
     Raises:
         ValueError: a system and a schedule of different lengths or measurements.

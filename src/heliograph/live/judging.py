@@ -66,16 +66,12 @@ class Judges:
         # Reasons by candidate; by plant the first of its implausible inputs.
         reasons, spoilt = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
-            candidate = taken[i]
-            if candidate.event.node_index >= 0:
-                why = (
-                    why_values(outputs[i][self._columns[candidate.event.node_index]])
-                    if _size(candidate.event) >= 0
-                    else None
-                )
+            event, plant = taken[i].event, taken[i].plant.name
+            if event.node_index >= 0:
+                why = why_values(outputs[i][self._columns[event.node_index]]) if _size(event) >= 0 else None
             elif why := self.why_inputs(outputs[i]):
-                first = spoilt.setdefault(candidate.plant.name, i)
-                spoilt[candidate.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
+                first = spoilt.setdefault(plant, i)
+                spoilt[plant] = min(first, i, key=lambda j: taken[j].row.key)
             if why:
                 reasons[i] = why
         # Of one node in one row the event with the largest number.

@@ -2,7 +2,6 @@
 
 from functools import cached_property, partial
 from typing import NamedTuple
-from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from heliograph.live.snapshot import Identity, network_identity
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant
+from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
@@ -197,11 +197,7 @@ class Lanes:
             for name, (kind, f, i) in self.network.places().items()
             if outcome["weighed"][kind] is not None
         }
-        central = {
-            (FUSED, name): list(columns)
-            for name, columns in outcome["weighed_centrally"].items()
-            if columns is not None
-        }
+        central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
         return {
             name: WeighedAt(*(tuple(map(int, field)) for field in columns))
             for name, columns in (parts | central).items()
@@ -221,15 +217,7 @@ class Lanes:
         }
 
 
-_SHARED: WeakValueDictionary[int, Lanes] = WeakValueDictionary()  # by the id of a network, which its entry keeps
-
-
-def shared_lanes(network: Network) -> Lanes:
-    """Return the lanes of this network, made at the first call."""
-    lanes = _SHARED.get(id(network))
-    if lanes is None:
-        lanes = _SHARED[id(network)] = Lanes(network)
-    return lanes
+shared_lanes = shared(Lanes)  # of a network, made at the first call
 
 
 def _part(i: int, judged: PyTree) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from functools import cached_property
 from typing import Any
-from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.limits import LimitsLike, limits_of
+from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -200,11 +200,4 @@ class _Placed:
         }
 
 
-_SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id of a filter, which its entry keeps
-
-
-def _place(filter: AbstractFilter) -> _Placed:
-    placed = _SHARED.get(id(filter))
-    if placed is None:
-        placed = _SHARED[id(filter)] = _Placed(filter)
-    return placed
+_place = shared(_Placed)

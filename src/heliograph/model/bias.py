@@ -40,10 +40,10 @@ def with_bias(
         sensor: its sensor.
         bias: standard deviation of each bias (biases,), or one for all; or the plant of b, independent of the first,
             whose inputs are some of its.
-        time: T, in which a bias of a given deviation is forgotten to 1/e, of each (biases,) or of all.
-        dt: time of a step, or the name of the input that says it.
-        coupling: E, how each bias drives the plant (n, biases).
-        loading: D, in which outputs each bias is (outputs, biases).
+        time: T, in which a bias of a given deviation is forgotten to 1/e, of each (biases,) or of all (default inf).
+        dt: time of a step, or the name of the input that says it (default 1).
+        coupling: E, how each bias drives the plant (n, biases) (default none).
+        loading: D, in which outputs each bias is (outputs, biases) (default none).
 
     Raises:
         ValueError: a negative deviation, a time that is not positive, another input, shapes that do not fit.

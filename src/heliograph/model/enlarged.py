@@ -29,6 +29,11 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
     The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
 
+    Args:
+        plant: linear.
+        sensor: linear.
+        channel: one that delivers late, by up to D steps.
+
     Raises:
         ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that
             depends on inputs.
@@ -226,6 +231,9 @@ class JointSensor(AbstractSensor):
 
 def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
+
+    Args:
+        sensors: by node; the outputs are named NODE_OUTPUT.
 
     Raises:
         ValueError: no sensors, or one that varies.

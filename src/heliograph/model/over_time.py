@@ -83,6 +83,9 @@ def over_time(items: Sequence[object]) -> OverTime:
 
     What channels remember without a name is one memory over time, whose transition may differ from step to step.
 
+    Args:
+        items: objects of one structure, one for each step.
+
     Raises:
         ValueError: no items, or items that differ in structure.
     """

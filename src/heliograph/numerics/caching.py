@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable
 from functools import cache, wraps
 from inspect import signature
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
-from weakref import ref
+from weakref import WeakValueDictionary, ref
 
 import jax
 import numpy as np
@@ -48,6 +48,23 @@ def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, 
         return answer
 
     return cast(Callable[Concatenate[S, P], T], known)
+
+
+def shared(make: Callable[[S], T]) -> Callable[[S], T]:
+    """Return the function with what it makes of an object shared by all who ask, as long as one of them holds it.
+
+    What is made must hold the object, whose identity is the key.
+    """
+    in_use: WeakValueDictionary[int, T] = WeakValueDictionary()
+
+    @wraps(make, updated=())
+    def once(source: S) -> T:
+        made = in_use.get(id(source))
+        if made is None:
+            made = in_use[id(source)] = make(source)
+        return made
+
+    return once
 
 
 def cached_arrays(function: Callable[P, T]) -> Callable[P, T]:

@@ -98,6 +98,9 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan (which may
     have chosen single precision).
+
+    Args:
+        function: of arrays or model objects; its results too.
     """
 
     @wraps(function)

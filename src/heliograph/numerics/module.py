@@ -15,43 +15,39 @@ import numpy as np
 from heliograph.numerics.names import refuse_attribute
 
 
-def same(value: Any, other: Any) -> bool:
+def same(x: Any, y: Any) -> bool:
     """Return one bool for objects that hold arrays: of the same class, and the same in each part.
 
     Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
     same as itself alone.
     """
-    if value is other:
+    if x is y:
         return True
-    if isinstance(value, jax.core.Tracer) or isinstance(other, jax.core.Tracer):
+    if isinstance(x, jax.core.Tracer) or isinstance(y, jax.core.Tracer):
         return False
-    if isinstance(value, np.ndarray | np.generic | jax.Array) and isinstance(
-        other, np.ndarray | np.generic | jax.Array
-    ):
-        return _same_array(value, other)
-    if type(value) is not type(other):
+    if isinstance(x, np.ndarray | np.generic | jax.Array) and isinstance(y, np.ndarray | np.generic | jax.Array):
+        return _same_array(x, y)
+    if type(x) is not type(y):
         return False
     # Containers and dataclasses, part by part.
-    if isinstance(value, Mapping):
-        return (
-            value.keys() == other.keys() and all(same(value[key], other[key]) for key in value) and _rest(value, other)
-        )
-    if isinstance(value, tuple | list):
-        return len(value) == len(other) and all(map(same, value, other))
-    if isinstance(value, partial):
-        return same((value.func, value.args, value.keywords), (other.func, other.args, other.keywords))
-    if is_dataclass(value):
-        return all(same(getattr(value, f.name, None), getattr(other, f.name, None)) for f in fields(value) if f.compare)
+    if isinstance(x, Mapping):
+        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x) and _rest(x, y)
+    if isinstance(x, tuple | list):
+        return len(x) == len(y) and all(map(same, x, y))
+    if isinstance(x, partial):
+        return same((x.func, x.args, x.keywords), (y.func, y.args, y.keywords))
+    if is_dataclass(x):
+        return all(same(getattr(x, f.name, None), getattr(y, f.name, None)) for f in fields(x) if f.compare)
     # Objects without an equality of their class are compared by their attributes.
-    kind: Any = type(value)
-    if kind.__eq__ is object.__eq__ and not callable(value) and getattr(value, "__dict__", None):
-        return same(vars(value), vars(other))  # nobody has said when two of these are equal
-    return bool(value == other) or (isinstance(value, float) and value != value and other != other)
+    kind: Any = type(x)
+    if kind.__eq__ is object.__eq__ and not callable(x) and getattr(x, "__dict__", None):
+        return same(vars(x), vars(y))  # nobody has said when two of these are equal
+    return bool(x == y) or (isinstance(x, float) and x != x and y != y)
 
 
-def _rest(value: object, other: object) -> bool:
+def _rest(x: object, y: object) -> bool:
     """Compare the attributes that a subclass of dict has in addition to its entries."""
-    return same(getattr(value, "__dict__", None), getattr(other, "__dict__", None))
+    return same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
 
 
 def _same_array(value: Any, other: Any) -> bool:

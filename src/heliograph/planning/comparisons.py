@@ -48,7 +48,7 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
     Args:
         problem: the design problem; its other limits of power stay.
         totals: total powers, shape (points,), positive.
-        advance: called with a word before each design.
+        advance: called with a word before each design (by default nothing is).
 
     Returns:
         totals in rising order, errors, and bounds below which no error is, each of shape (points,).
@@ -102,7 +102,7 @@ def error_over_sites(
         build: function that returns the network for a place (x, y).
         x: places, shape (columns,).
         y: places, shape (rows,).
-        advance: called with a word before each row.
+        advance: called with a word before each row (by default nothing is).
 
     Returns:
         x, y, the errors at all places, shape (rows, columns), and the best place.
@@ -147,7 +147,7 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
     Args:
         best: the design of a network.
         exponent: exponent of the path loss; relays are not tried without.
-        advance: called with a word before each design.
+        advance: called with a word before each design (by default nothing is).
 
     Returns:
         Changes by name, with the value of the design and what it saves, the most first.

@@ -57,10 +57,12 @@ def design(
             others of that node), all unless given; the others keep their power. Of a function {name: (start, low,
             high)}, or none where `hg.free` marks the numbers in it.
         error: the error that is to be small; the steady trace unless given.
-        budget: the total mean power, or a `Budget`; of relays that filter, what all together may send in each slot.
-        target_error: an error; then the least total mean power is sought that reaches it, within the budget if any.
-        starts: number of descents, where the problem is not convex.
-        seed: of the starts that are drawn.
+        budget: the total mean power, or a `Budget`; of relays that filter, what all together may send in each slot
+            (default none).
+        target_error: an error; then the least total mean power is sought that reaches it, within the budget if any
+            (default none).
+        starts: number of descents, where the problem is not convex (default 64).
+        seed: of the starts that are drawn (default 0).
 
     Returns:
         The design, with its certificate.

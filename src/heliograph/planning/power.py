@@ -81,8 +81,8 @@ def power(
         network: the network.
         horizon: number of steps from the plant's initial law on; the steady state of a linear plant unless given.
         inputs: inputs of the plant, (horizon, inputs); zero unless given.
-        runs: number of drawn trajectories, where plant or sensors are not linear.
-        seed: of the draws.
+        runs: number of drawn trajectories, where plant or sensors are not linear (default 1000).
+        seed: of the draws (default 0).
 
     Returns:
         The powers, with standard errors where they are drawn.
@@ -217,10 +217,8 @@ def _drawn_moments(
             return x, moments
 
         start = at(plant, 0).sample_initial(begin)
-        moments_over_time: dict[str, jax.Array] = jax.lax.scan(
-            step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs))
-        )[1]
-        return moments_over_time
+        over_time: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+        return over_time
 
     runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
     return jax.tree.map(lambda moments: moments.mean(axis=1), runs)  # type: ignore[no-any-return]

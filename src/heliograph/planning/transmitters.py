@@ -88,9 +88,8 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
         case Series():
             visited, position = _visit_chain(channel.maps, visit, position)
         case Stack():
-            positions = [
-                Position(f"{position.prefix}part{i}.", 0, position.signal) for i in range(1, len(channel.maps) + 1)
-            ]
+            prefixes = [f"{position.prefix}part{i}." for i in range(1, len(channel.maps) + 1)]
+            positions = [Position(prefix, 0, position.signal) for prefix in prefixes]
             visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, positions, strict=True)]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.

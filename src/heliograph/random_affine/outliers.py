@@ -233,12 +233,9 @@ def nominal(noise: AbstractNoise) -> Nominal:
     """The first branch of contaminated noise, the scale of Student's, the law's own moments else."""
     match noise:
         case Independent():
-            items = [nominal(component) for component in noise.parts]
+            items = [nominal(law) for law in noise.parts]
             xp, block = library(items), scipy_for(items).linalg.block_diag
-            return Nominal(
-                xp.concatenate([component.mean for component in items]),
-                block(*[component.covariance for component in items]),
-            )
+            return Nominal(xp.concatenate([law.mean for law in items]), block(*[law.covariance for law in items]))
         case Contaminated():
             return Nominal(noise.means[0] - noise.mean, noise.covariances[0])
         case StudentT():

@@ -57,6 +57,10 @@ class RelayDesign(Module):
 def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     """Compute error covariances and power of a `network` under any gains, {filter: (steps, n, received)}.
 
+    Args:
+        network: relays that filter.
+        gains: K by filter, (steps, n, received).
+
     Raises:
         ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
     """
@@ -121,6 +125,10 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
     "exact" for complete data from the network it was designed for.
 
+    Args:
+        network: relays that filter.
+        design: of this network.
+
     Raises:
         ValueError: a design of another network.
     """
@@ -181,6 +189,10 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
     what the receiver can know later (see `receiver_error_design`).
 
+    Args:
+        network: relays that filter.
+        horizon: number of steps.
+
     Raises:
         ValueError: a horizon beyond what varies over time; a singular innovation moment.
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
@@ -210,6 +222,10 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
 
     z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
     `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for smoothing.
+
+    Args:
+        network: relays that filter.
+        gains: K by relay, (steps, n, received).
 
     Raises:
         ValueError: what `receiver_behind_relays` refuses.

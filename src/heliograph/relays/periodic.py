@@ -52,6 +52,9 @@ def periodic_steps(network: RelayNetwork) -> Steps:
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
 
+    Args:
+        network: relays that filter, in slots that repeat.
+
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
@@ -65,6 +68,10 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """Return the steady state of a `network` under given gains, one entry per slot: {filter: (slots, n, received)}.
 
     The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
+
+    Args:
+        network: relays that filter, in slots that repeat.
+        gains: K by filter, (slots, n, received).
 
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
@@ -355,20 +362,16 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
 
 
 def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    propagated, n = steady(steps, gains), steps.transition.shape[-1]
-    last = propagated.moments[1:, -n:, -n:]
-    return (
-        jnp.trace(last, axis1=1, axis2=2),
-        is_covariance(propagated.moments),
-        jnp.sum(propagated.power[:, 1:], axis=1),
-    )
+    end, n = steady(steps, gains), steps.transition.shape[-1]
+    last = end.moments[1:, -n:, -n:]
+    return jnp.trace(last, axis1=1, axis2=2), is_covariance(end.moments), jnp.sum(end.power[:, 1:], axis=1)
 
 
 def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    propagated, n = steady(steps, gains), steps.transition.shape[-1]
+    end, n = steady(steps, gains), steps.transition.shape[-1]
     spread = steady_behind(steps, gains)
-    sound = is_covariance(propagated.moments[:, :-n, :-n]) & is_covariance(spread)
-    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(propagated.power[:, 1:], axis=1)
+    sound = is_covariance(end.moments[:, :-n, :-n]) & is_covariance(spread)
+    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(end.power[:, 1:], axis=1)
 
 
 _receiver_cost = _value(_receiver_traces)

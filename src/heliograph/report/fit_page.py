@@ -65,13 +65,11 @@ def _estimates(learned: Learned) -> Figure:
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         # The form that counts is on top; a cross marks a number that the data do not determine.
         for j, form in enumerate(reversed(forms)):
-            estimate = by_form[form][i]
+            e = by_form[form][i]
             color = BLUE if j == 0 else MUTED
-            if np.isfinite([estimate.low, estimate.high]).all():
-                axes.plot(
-                    [estimate.low, estimate.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7
-                )
-            axes.plot(estimate.estimate, -j, "o" if estimate.identified else "x", color=color, markersize=6)
+            if np.isfinite([e.low, e.high]).all():
+                axes.plot([e.low, e.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
+            axes.plot(e.estimate, -j, "o" if e.identified else "x", color=color, markersize=6)
         axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
@@ -87,15 +85,12 @@ def _correlations(tested: list[Change]) -> Figure:
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
     # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, change in zip(grid, tested, strict=True):
-        for shift, color, judged, label in (
-            (-0.17, AMBER, change.before, "before"),
-            (0.17, BLUE, change.after, "after"),
-        ):
-            assert judged.test is not None
-            lags = np.arange(1, len(judged.test.correlation) + 1)
-            axes.bar(lags + shift, judged.test.correlation, 0.3, color=color, label=label)
+        for shift, color, e, label in ((-0.17, AMBER, change.before, "before"), (0.17, BLUE, change.after, "after")):
+            assert e.test is not None
+            lags = np.arange(1, len(e.test.correlation) + 1)
+            axes.bar(lags + shift, e.test.correlation, 0.3, color=color, label=label)
             axes.errorbar(
-                lags + shift, judged.test.correlation, 1.96 * judged.test.standard_error, fmt="none", ecolor=MUTED, lw=1
+                lags + shift, e.test.correlation, 1.96 * e.test.standard_error, fmt="none", ecolor=MUTED, lw=1
             )
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
         axes.set_title(in_figure(f"{change.node}/{change.filter}"))

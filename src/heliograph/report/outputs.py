@@ -169,10 +169,8 @@ class RecentOutputs:
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
-    chosen = (
-        listener for listener in listeners(network, record) if listener.name in record.weighed.get(listener.node, {})
-    )
-    return [output for listener in chosen for output in outputs_of(listener, record, np.zeros(0))]
+    chosen = (x for x in listeners(network, record) if x.name in record.weighed.get(x.node, {}))
+    return [output for x in chosen for output in outputs_of(x, record, np.zeros(0))]
 
 
 def output_numbers(health: OutputHealth) -> dict[str, Json]:

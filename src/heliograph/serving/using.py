@@ -79,9 +79,7 @@ class Using:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
         given = [(i, message, message.values if message.node == INPUTS else message.inputs)
                  for i, message in enumerate(messages) if isinstance(message, Message)]  # fmt: skip
-        given = [
-            (i, message, values) for i, message, values in given if values and len(values) == self.fleet.lanes.given
-        ]
+        given = [(i, m, values) for i, m, values in given if values and len(values) == self.fleet.lanes.given]
         plants = [self.plants.get(message.plant) for _, message, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
         why = self._judges.implausible_inputs(plants, numbers)

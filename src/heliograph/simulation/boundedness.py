@@ -79,9 +79,12 @@ def certify_boundedness(network: Network) -> Boundedness:
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
 
+    Args:
+        network: linear, of nodes that receive their sensors over channels that do not vary.
+
     Raises:
-        ValueError: a plant, sensor or channel that varies or is not linear, relays that filter, too many sets of
-            losses.
+        ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late, relays that
+            filter, too many sets of losses.
 
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
@@ -131,6 +134,8 @@ def _links(network: Network, states: int) -> Links:
 def _constant(channel: Channel) -> AbstractRandomAffine:
     if isinstance(channel, OverTime):
         raise fail("boundedness", "channels that do not vary", "one that varies")
+    if channel.past:
+        raise fail("boundedness", "channels without delays", f"one that is late by up to {channel.past} steps")
     return channel
 
 

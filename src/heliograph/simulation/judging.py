@@ -22,17 +22,13 @@ RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
     """Test whether some filter judges its measurement implausible."""
-    items = [
-        jnp.any(judgement.implausible) for judgement in (*outputs["judged"], *outputs["judged_centrally"].values())
-    ]
+    items = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
     return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
     """Test the same of stored results."""
-    return any(
-        (judgement.reason > 0).any() for judgement in (*outputs["judged"], *outputs["judged_centrally"].values())
-    )
+    return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
 def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
@@ -87,9 +83,7 @@ class Judges:
 
     def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of all filters."""
-        places = [
-            (k, f, i) for k, judgement in enumerate(outputs["judged"]) for f, i in np.ndindex(*judgement[0].shape[-2:])
-        ]
+        places = [(k, f, i) for k, j in enumerate(outputs["judged"]) for f, i in np.ndindex(*j[0].shape[-2:])]
         return self._rows(outputs, places, True)
 
     def _rows(

@@ -192,12 +192,12 @@ class Slots(AbstractMedium):
     """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
 
     A hop with memory moves on at every step, used or not; the same pair in another slot is another hop.
+
+    `estimates_at`: kind, filter and node of each relay's estimate.
     """
 
     relays: RelayNetwork
-    estimates_at: tuple[tuple[int, int, int], ...] = eqx.field(
-        static=True
-    )  # kind, filter and node of each relay's estimate
+    estimates_at: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
     memories: dict[str, np.ndarray]  # places of the memories of each hop that has some
 

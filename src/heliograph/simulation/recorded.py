@@ -57,7 +57,7 @@ def run(
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
             at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
             fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
-            message did not arrive. They may be left out where the links are deterministic.
+            message did not arrive. They may be left out where the links are deterministic (default none).
 
     Returns:
         The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.

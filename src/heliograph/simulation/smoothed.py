@@ -83,11 +83,8 @@ class Smoother(Module):
             return Estimate(nearest(mean, others, which), estimate.covariance, estimate.claim)
 
         every = next((which for which in angles if which), ())
-        estimates = tuple(near(estimate, which) for estimate, which in zip(known["estimates"], angles, strict=True))
-        return {
-            "estimates": estimates,
-            "fused": {name: near(estimate, every) for name, estimate in known["fused"].items()},
-        }
+        estimates = tuple(near(e, which) for e, which in zip(known["estimates"], angles, strict=True))
+        return {"estimates": estimates, "fused": {name: near(e, every) for name, e in known["fused"].items()}}
 
 
 def _combined(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:

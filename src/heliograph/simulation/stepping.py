@@ -257,11 +257,7 @@ def _plan(
         return planned_with_past(filter, u) if smooths else filter.planned(u)
 
     planned = tuple(
-        replace(
-            stacked,
-            filters=over_all(partial(single, smooths=stacked.smooths), stacked.count * stacked.nodes)(stacked.filters),
-        )
-        for stacked in alike
+        replace(a, filters=over_all(partial(single, smooths=a.smooths), a.count * a.nodes)(a.filters)) for a in alike
     )
     return planned, {name: single(filter, smooths) for name, filter in central.items()}
 
@@ -293,6 +289,10 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
     that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
     the bound on its error. Claim: as the fusion's.
+
+    Args:
+        network: the network.
+        name: of its fusion.
 
     Raises:
         ValueError: no fusion of this name, or one by another rule.

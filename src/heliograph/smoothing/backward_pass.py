@@ -117,8 +117,7 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
     end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
     _, smoothed = jax.lax.scan(body, end, rows, reverse=True)
     mean, covariance = (
-        jnp.concatenate([values, final[None]])
-        for values, final in zip(smoothed, estimate_from(last, end[1]), strict=True)
+        jnp.concatenate([a, b[None]]) for a, b in zip(smoothed, estimate_from(last, end[1]), strict=True)
     )
     return mean, covariance
 

@@ -222,22 +222,6 @@ def network(s: Scenario) -> hg.Network:
     return _assemble(s, [filters(s, i) for i in range(len(NODES))], {**zero_mean_fusion(s), **fused})
 
 
-def early_network(s: Scenario) -> hg.Network:
-    """The zero-mean filter alone, and what is made of it."""
-    return _assemble(s, _only(s, "cubature_zero_mean"), zero_mean_fusion(s))
-
-
-def shown_network(s: Scenario) -> hg.Network:
-    """The paper's filter and its fusion."""
-    fused = {"ci_printed": hg.Fusion("cubature_printed_fixed", hg.CovarianceIntersection())}
-    return _assemble(s, _only(s, "cubature_printed_fixed"), fused)
-
-
-def literal_network(s: Scenario) -> hg.Network:
-    """The same nodes, which receive the same, with the literal readings of Algorithm 1."""
-    return _assemble(s, [variants(s, i) for i in range(len(NODES))], {})
-
-
 def zero_mean_fusion(s: Scenario) -> dict[str, hg.Fusion | hg.filters.AbstractFilter]:
     """What is made of the zero-mean filter's estimates, and the central filter with its update."""
     return {
@@ -274,14 +258,17 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
             work = partial(simulate, network, horizon, count, setting.seed, stages)
             for node, by_name in stages(f"{s.name}: {what}", work).items():
                 statistics.setdefault(node, {}).update(by_name)
-        return Runs(s, statistics, hg.monte_carlo(shown_network(s), horizon, 1, setting.seed))
+        papers = {"ci_printed": hg.Fusion("cubature_printed_fixed", hg.CovarianceIntersection())}
+        shown = _assemble(s, _only(s, "cubature_printed_fixed"), papers)
+        return Runs(s, statistics, hg.monte_carlo(shown, horizon, 1, setting.seed))
 
-    printed, strong = (
-        runs(s, {"filters": network(s), "literal readings": literal_network(s)}, s.horizon, setting.runs)
-        for s in (setting.printed, setting.strong)
-    )
-    first = {"first steps": early_network(setting.strong)}
-    early = runs(setting.strong, first, setting.early, setting.early_factor * setting.runs)
+    def both(s: Scenario) -> Runs:
+        literal = _assemble(s, [variants(s, i) for i in range(len(NODES))], {})  # the nodes receive the same
+        return runs(s, {"filters": network(s), "literal readings": literal}, s.horizon, setting.runs)
+
+    printed, strong, s = both(setting.printed), both(setting.strong), setting.strong
+    first = {"first steps": _assemble(s, _only(s, "cubature_zero_mean"), zero_mean_fusion(s))}
+    early = runs(s, first, setting.early, setting.early_factor * setting.runs)
     return outcome(setting, printed, strong, early)
 
 

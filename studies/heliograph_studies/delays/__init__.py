@@ -127,8 +127,10 @@ class Outcome:
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Everything."""
     simulated = stages("links that are late", lambda: late_scores(setting))
-    in_motion = stages("a wrong clock, in motion", lambda: moving_clocks(setting))
-    at_rest = stages("at rest", lambda: resting_clocks(setting))
+    moved, still = moving(1.0), moving(0.0, noise=0.0, spread=(0.0, 0.0))
+    believed = moving(0.0, spread=(1.0, 0.1))  # at rest, but the filters believe in motion
+    in_motion = stages("a wrong clock, in motion", lambda: clock_scores(*moved, listeners(*moved), setting))
+    at_rest = stages("at rest", lambda: clock_scores(*still, listeners(*believed), setting))
     delays, claim = stages("before data", lambda: (before_data(simulated), trap()))
     alone = {name.removesuffix("_alone"): score for name, score in in_motion.items() if name.endswith("_alone")}
     clocks = {"moving": in_motion, "at_rest": at_rest}
@@ -180,18 +182,6 @@ def before_data(simulated: Mapping[str, Late]) -> dict[str, Late]:
             errors: Errors = {"true_before_data": mean, "true_before_data_over_time": true}
             result[name] = replace(simulated[name], before_data=errors)
     return result
-
-
-def moving_clocks(setting: Setting) -> Clocks:
-    """Of all filters, in motion."""
-    plant, sensors = moving(1.0)
-    return clock_scores(plant, sensors, listeners(plant, sensors), setting)
-
-
-def resting_clocks(setting: Setting) -> Clocks:
-    """Of filters that believe in motion, at rest."""
-    plant, sensors = moving(0.0, noise=0.0, spread=(0.0, 0.0))
-    return clock_scores(plant, sensors, listeners(*moving(0.0, spread=(1.0, 0.1))), setting)
 
 
 def clock_scores(

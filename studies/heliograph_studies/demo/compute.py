@@ -164,6 +164,7 @@ def designs(recording: PlazaRecording, scores: list[Score], seeds: range) -> dic
     see E (y - r)^2: near the start it is small, and on this drive a quarter throughout.
     """
     drive = robot.DRIVES[recording.name]
+    # r: the ranges at the known start; what is sent is y - r.
     reference = robot.RANGE_SCALE * np.linalg.norm(drive.start[:2] - drive.beacons, axis=1)
     plant, sensor = robot.model(drive, robot.Constants(drive.gyro_rate))
     channels = {name: channel_less(reference, power) for name, power in DESIGNS.items()}
@@ -172,11 +173,13 @@ def designs(recording: PlazaRecording, scores: list[Score], seeds: range) -> dic
         for name, channel in channels.items()
     }
     network = hg.Network(plant, nodes)
+    # The same draws of the relay for all designs.
     scored: dict[str, list[Score]] = {name: [] for name in DESIGNS}
     for seed in seeds:
         received = {name: relay(channel, recording.ranges, seed) for name, channel in channels.items()}
         for name, estimate in estimated(recording, network, received).items():
             scored[name].append(score(estimate, recording.truth))
+    # Powers E (y - r)^2 of what is sent.
     plain = _design(recording.ranges, np.zeros(len(reference)), 1.0, scores)
     less = {name: _design(recording.ranges, reference, power, scored[name]) for name, power in DESIGNS.items()}
     return {"as_it_is": plain, **less}

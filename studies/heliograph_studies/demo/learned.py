@@ -41,10 +41,8 @@ def score(estimate: Estimate, truth: np.ndarray, first: int = 0) -> Score:
 
 def position_nees(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
     """e' B^-1 e / 2 of the position at each row, (rows,)."""
-    error = (np.asarray(estimate.mean) - truth)[:, :2, None]
-    weighted = np.linalg.solve(np.asarray(estimate.covariance)[:, :2, :2], error)
-    result: np.ndarray = np.sum(error * weighted, axis=(1, 2)) / 2
-    return result
+    mean, covariance = np.asarray(estimate.mean)[:, :2], np.asarray(estimate.covariance)[:, :2, :2]
+    return np.asarray(hg.nees(truth[:, :2], mean, covariance) / 2)
 
 
 FIRST_GUESS = robot.Constants(0.0, 1.0, 1.0, 0.02, 1e-5)  # of one who knows nothing but that odometry drifts slowly

@@ -129,6 +129,7 @@ def house(setting: Setting, progress: Progress) -> tuple[dict[str, dict[str, Sco
 
 def room(setting: Setting, plant: hg.LinearPlant, seed: int) -> tuple[dict[str, Score], np.ndarray]:
     """Scores of every recipe in a room, and what its sensor transmitted."""
+    # Each recipe as a filter of the same room.
     parts = plant, setting.sensor, setting.link, setting.trigger
     filters = {
         "missing": hg.kalman_filter(plant, setting.sensor),
@@ -137,11 +138,13 @@ def room(setting: Setting, plant: hg.LinearPlant, seed: int) -> tuple[dict[str, 
     }
     network = hg.Network(plant, {"room": hg.Node(setting.sensor, setting.link, filters, trigger=setting.trigger)})
     record = hg.monte_carlo(network, 60 * setting.hours, setting.runs, seed)
+    # Squared error over the claimed variance, by recipe.
     scores = {}
     for name in filters:
         squares = record.errors("room", name)[..., 0] ** 2
         scores[name] = score(squares, np.asarray(record.estimates["room"][name].covariance)[..., 0, 0])
     assert record.truth is not None  # it was simulated
+    # The last value as a measurement is no filter of the library.
     mean, variance = last_value(setting, plant, record.measurements["room"][..., 0])
     scores["last"] = score((record.truth[..., 0] - mean) ** 2, variance)
     return scores, record.transmissions["room"]
@@ -172,6 +175,7 @@ def last_value(setting: Setting, plant: hg.LinearPlant, z: np.ndarray) -> tuple[
 def against_messages(setting: Setting) -> tuple[dict[str, dict[str, list[float]]], list[float]]:
     """Of each rule in a typical room messages an hour and errors in kelvin, and the least errors, without losses."""
     plant, sensor = rooms()[TYPICAL], setting.sensor
+    # Each rule at several thresholds.
     rules: dict[str, list[hg.model.AbstractTrigger]] = {
         "periodic": [hg.Periodic(period) for period in PERIODS],
         "on change": [hg.SendOnDelta(delta) for delta in DELTAS],
@@ -187,6 +191,7 @@ def against_messages(setting: Setting) -> tuple[dict[str, dict[str, list[float]]
             "messages": [60 * item.rate for item in results],
             "error": [float(np.sqrt(item.error[0])) for item in results],
         }
+    # Least error of any rule at the rates of on change.
     rates = [count / 60 for count in curves["on change"]["messages"]]
     return curves, [float(np.sqrt(least_error(plant, sensor, rate))) for rate in rates]
 

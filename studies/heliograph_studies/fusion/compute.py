@@ -10,7 +10,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.numerics.check import fail
-from heliograph_studies import Inline, Stages, Unlisted, check_fields
+from heliograph_studies import Inline, Stages, Unlisted, check_fields, sampled
 from heliograph_studies.cubature_fusion import setting as machine
 
 Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
@@ -173,9 +173,8 @@ def measured(setting: Setting) -> dict[str, dict[str, float]]:
 
 def against_peers(claimed: float, errors: np.ndarray) -> dict[str, float]:
     """The mean of squared errors (runs, n) with its standard error, beside what is claimed of it."""
-    square = np.sum(errors**2, axis=-1)
-    error = float(square.std(ddof=1) / np.sqrt(len(square)))
-    return {"claimed": float(claimed), "measured": float(square.mean()), "standard_error": error}
+    measured, error = sampled(np.sum(errors**2, axis=-1))
+    return {"claimed": float(claimed), "measured": measured, "standard_error": error}
 
 
 def tree(setting: Setting) -> tuple[dict[str, float], list[np.ndarray], dict[str, float]]:
@@ -219,6 +218,7 @@ def scale(setting: Setting) -> dict[str, float | None]:
     plant, parts = moving_point(), node_parts(setting.tree_nodes, setting.seed)
     numbers = {"output": np.array([part[0] for part in parts]), "noise": np.array([part[4] for part in parts])}
 
+    # A tree of relays over many leaves.
     def leaf(part: dict[str, Any]) -> hg.Node:
         sensor, gain = hg.LinearSensor(part["output"], 0.3 * np.eye(2)), hg.Discrete([0.5, 1.0], [0.5, 0.5])
         channel = hg.hop(gain, part["noise"] * np.eye(2))
@@ -228,6 +228,7 @@ def scale(setting: Setting) -> dict[str, float | None]:
     grown = hg.simulation.relay_tree(plant, leaf, numbers, setting.degree, setting.many_steps)
     tree_took, tree_peak = _since(begin), peak_gb()
     begin = time.perf_counter(), time.process_time()
+    # All cross-covariances of fewer nodes, and their matrix weights.
     crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.crossed_nodes]), LOCAL, setting.many_steps)
     pairs, (_, covariance) = crossed.joint, crossed.matrix_weights()
     took = _since(begin)
@@ -284,6 +285,7 @@ def strong(setting: Setting) -> dict[str, Any]:
 def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
     """Three rooms whose nodes report every d-th step, or on event: reports per step and node, error, and claim."""
     plant, parts = described("three_rooms")
+    # Reports every d-th step, or where the estimate has moved by a threshold.
     every = {f"every {d}": hg.fusion.ReportLink(every=d) for d in setting.intervals}
     fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
         name: hg.Fusion(LOCAL, hg.fusion.AllReports(), uplink=link) for name, link in every.items()
@@ -295,6 +297,7 @@ def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
             fused[name] = hg.Fusion(LOCAL, hg.fusion.AllReports(), quantizer=sends)
     net = hg.Network(plant, network(plant, parts).nodes, fused)
     sums = hg.monte_carlo(net, setting.traffic_steps, setting.runs // 4, setting.seed, hg.Statistics())["fused"]
+    # Averages over the second half of the steps.
     result: dict[str, list[dict[str, float]]] = {"every": [], "informed": [], "uninformed": []}
     late = slice(setting.traffic_steps // 2, None)
     for name, item in sums.items():

@@ -8,20 +8,24 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies import Inline, Stages, Unlisted
+from heliograph_studies import Inline, Stages, Unlisted, sampled
 from heliograph_studies.h_infinity_fusion.discriminating import NODE, Discriminating, discriminate
 from heliograph_studies.h_infinity_fusion.example import (
     MORE_QUANTIZERS,
     QUANTIZERS,
     RECURSIVE,
+    Growth,
+    Indices,
+    Replayed,
     Runs,
     fused_name,
-    mean_and_error,
+    growth,
+    indices,
+    replay,
     simulate,
     simulate_known,
+    violation,
 )
-from heliograph_studies.h_infinity_fusion.growth import Growth, growth, violation
-from heliograph_studies.h_infinity_fusion.indices import Indices, Replayed, indices, replay
 from heliograph_studies.h_infinity_fusion.levels import (
     NodeDesigns,
     Readings,
@@ -74,7 +78,7 @@ class Parts:
     def difference(self, quantizer: str, other: str) -> tuple[float, float, float]:
         """Mean over runs of the difference of fused errors, its standard error, and the share of runs below 0."""
         gap = (self.runs.errors(RECURSIVE, quantizer) - self.runs.errors(RECURSIVE, other)).mean(axis=1)
-        return *mean_and_error(gap), float((gap < 0).mean())
+        return *sampled(gap), float((gap < 0).mean())
 
     def saturated(self, quantizer: str, first: int = 0) -> float:
         """Share of samples out of reach from step `first` on."""

@@ -1,6 +1,5 @@
 """The second example's numbers: levels with and without structure, errors under three disturbances, worst cases."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -9,9 +8,11 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters.wrappers.fed_back import prediction_of
-from heliograph_studies.h_infinity_fusion.example import Mean, mean_and_error
+from heliograph_studies import sampled
+from heliograph_studies.h_infinity_fusion.example import Mean
 from heliograph_studies.h_infinity_fusion.levels import without_gain
-from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws, World, Worst, worst_disturbance
+from heliograph_studies.h_infinity_fusion.setting import Setting
+from heliograph_studies.h_infinity_fusion.worst_disturbance import World, Worst, worst_disturbance
 
 STEPS = 40
 DAMPING, ANGLE = 0.97, 0.5  # of the rotation: its period is 4 pi steps
@@ -21,8 +22,7 @@ DISTURBANCE = np.array([[0.0], [1.0]])
 TARGET = np.eye(2)
 WEIGHT = 1.0
 OUTPUTS = {"1": [[1.0, 0.0]], "2": [[0.0, 1.0]], "3": [[0.7, 0.7]]}
-ARRIVAL = (0.95, 0.95, 0.9)
-NOISE_GAIN = (3.0, 3.0, 9.0)
+LINKS = Setting(steps=STEPS, arrival=(0.95, 0.95, 0.9), powers=(1.0, 1.0, 1.0), noise_gain=(3.0, 3.0, 9.0))
 INPUTS = ("v", "moving", "white")
 SCENARIOS = ("white", "bias", "resonant")
 BOX = 100.0  # half the side of the box over which phi is searched
@@ -62,33 +62,11 @@ def sensor(node: str) -> hg.LinearSensor:
     return hg.LinearSensor(OUTPUTS[node], 0.0)
 
 
-def lossy(link: int) -> hg.random_affine.AbstractRandomAffine:
-    """A link that loses without telling."""
-    return hg.hop(hg.random_affine.bernoulli(ARRIVAL[link]), NOISE_GAIN[link] ** 2)
-
-
-def lossless(link: int) -> hg.random_affine.AbstractRandomAffine:
-    """The link without losses."""
-    return hg.hop(1.0, NOISE_GAIN[link] ** 2)
-
-
-def known(link: int) -> hg.random_affine.AbstractRandomAffine:
-    """A link that loses and tells."""
-    return hg.erasure(lossless(link), ARRIVAL[link])
-
-
-def channel(
-    hop: Callable[[int], hg.random_affine.AbstractRandomAffine] = lossy,
-) -> hg.random_affine.AbstractRandomAffine:
-    """Through a relay and directly."""
-    return hg.model.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
-
-
 def system(node: str, structured: bool = True) -> hg.h_infinity.GrowthSystem:
     """What designs read; not `structured`: all of A x + phi(x) known by its growth |A| + |phi| alone."""
     shape = {"growth": GROWTH, "transition": ROTATION} if structured else {"growth": DAMPING + GROWTH}
     return hg.h_infinity.growth_system(
-        STEPS, DISTURBANCE, [[0.0]], TARGET, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
+        STEPS, DISTURBANCE, [[0.0]], TARGET, LINKS.unit_channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
     )
 
 
@@ -106,30 +84,12 @@ def world(node: str) -> World:
     )
 
 
-def draws(count: int, seed: int) -> Draws:
-    """Arrivals of `count` runs as gains."""
-    return relay_draws(ARRIVAL, NOISE_GAIN, (1.0, 1.0, 1.0), STEPS, count, seed)
-
-
-def relay_draws(
-    arrival: Sequence[float], noise_gain: Sequence[float], powers: Sequence[float], steps: int, count: int, seed: int
-) -> Draws:
-    """G and N of a scalar relay beside a direct link: sqrt(E1 E2) b1 b2 y + sqrt(E2) b2 n1 + n2, sqrt(E3) b3 y + n3."""
-    first, second, direct = (np.random.default_rng(seed).random((count, steps, 3)) < arrival).astype(float).T
-    first, second, direct = first.T, second.T, direct.T
-    zero, item = np.zeros_like(first), np.ones_like(first)
-    c, e = noise_gain, np.sqrt(powers)
-    gain = np.stack([e[0] * e[1] * first * second, e[2] * direct], axis=-1)[..., None]
-    relayed = np.stack([e[1] * second * c[0], c[1] * item, zero], axis=-1)
-    straight = np.stack([zero, zero, c[2] * item], axis=-1)
-    return Draws(gain, np.stack([relayed, straight], axis=-2))
-
-
 NODE = "1"  # whose worst cases are searched
 RUNS = 1_000  # at most: errors here are large and alike
 ENERGIES = (1.0, 160.0, 1000.0)  # where phi is its slope, of order one, and saturated
 SEARCH_DRAWS, JUDGE_DRAWS = 32, 2_000
 Errors = dict[str, Mean]  # by filter
+Designs = dict[str, dict[str, hg.h_infinity.HInfinityDesign]]  # by name and node
 
 
 @dataclass(frozen=True)
@@ -142,7 +102,7 @@ class Discriminating:
     (time,) the mean of the fused one over runs.
     """
 
-    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
+    designs: Designs
     certificates: dict[str, hg.h_infinity.HInfinityCertificate]
     without_structure: dict[str, float]
     without_structure_or_gain: float
@@ -170,9 +130,9 @@ def discriminate(runs: int, seed: int) -> Discriminating:
     return Discriminating(designs, certificates, flat, blind, finding, *simulated, worst_cases(designs), count)
 
 
-def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
+def design() -> Designs:
     """The horizon and the recursive design of each node at their smallest levels, and what K = 0 proves."""
-    results: dict[str, dict[str, hg.h_infinity.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
+    results: Designs = {"horizon": {}, "recursive": {}, "zero_gain": {}}
     for node in OUTPUTS:
         growing = system(node)
         results["horizon"][node] = hg.h_infinity.horizon_design(growing, separate=True)
@@ -181,29 +141,27 @@ def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     return results
 
 
-def filters(
-    node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
-) -> dict[str, hg.filters.AbstractFilter]:
+def filters(node: str, designs: Designs) -> dict[str, hg.filters.AbstractFilter]:
     """All filters of a node but the one that knows of losses; each predicts."""
     believed, seen, growing = plant(False), sensor(node), system(node)
     results: dict[str, hg.filters.AbstractFilter] = {
         name: hg.filters.h_infinity_filter(believed, seen, growing, element[node]) for name, element in designs.items()
     }
     results["open_loop"] = hg.filters.open_loop_filter(believed)
-    for name, hop in (("ekf_ignoring", lossless), ("ekf_statistics", lossy)):
-        results[name] = prediction_of(hg.extended_filter(believed, seen, channel(hop)))
+    for name, hop in (("ekf_ignoring", LINKS.lossless), ("ekf_statistics", LINKS.lossy)):
+        results[name] = prediction_of(hg.extended_filter(believed, seen, LINKS.unit_channel(hop)))
     return results
 
 
-def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
+def networks(designs: Designs) -> list[hg.Network]:
     """Network whose receivers do not know of losses, and one whose do, with other draws."""
-    believed, certain, losing = plant(False), channel(lossless), channel()
+    believed, certain, losing = plant(False), LINKS.unit_channel(LINKS.lossless), LINKS.unit_channel()
     unaware, informed = {}, {}
     for node in OUTPUTS:
         seen = sensor(node)
         extended = prediction_of(hg.extended_filter(believed, seen, certain))
         unaware[node] = hg.Node(seen, losing, filters(node, designs))
-        informed[node] = hg.Node(seen, channel(known), {"ekf_known": extended})
+        informed[node] = hg.Node(seen, LINKS.unit_channel(LINKS.known), {"ekf_known": extended})
     rule = hg.fusion.WeightedFusion(np.full(len(unaware), 1 / len(unaware)))
     return [
         hg.Network(plant(), nodes, {name: hg.Fusion(name, rule) for name in nodes[NODE].filters})
@@ -212,7 +170,7 @@ def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> li
 
 
 def simulate(
-    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]], runs: int, seed: int
+    designs: Designs, runs: int, seed: int
 ) -> tuple[dict[str, Errors], dict[str, Errors], dict[str, dict[str, np.ndarray]]]:
     """Mean norm of the error by scenario and filter: fused, of one node, and fused over time."""
     errors: dict[str, Errors] = {scenario: {} for scenario in SCENARIOS}
@@ -223,14 +181,14 @@ def simulate(
             record = hg.monte_carlo(network, STEPS, runs, seed, inputs=inputs(scenario))
             for name in network.fused:
                 norms = np.linalg.norm(record.errors("fused", name), axis=-1)
-                errors[scenario][name] = mean_and_error(norms.mean(axis=1))
+                errors[scenario][name] = Mean(*sampled(norms.mean(axis=1)))
                 over_time[scenario][name] = norms.mean(axis=0)
                 separate = np.linalg.norm(record.errors(NODE, name), axis=-1)
-                local[scenario][name] = mean_and_error(separate.mean(axis=1))
+                local[scenario][name] = Mean(*sampled(separate.mean(axis=1)))
     return errors, local, over_time
 
 
-def worst_cases(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> dict[str, Worst]:
+def worst_cases(designs: Designs) -> dict[str, Worst]:
     """Lower bounds on the true levels of one node's filters; they run on the channel that does not tell."""
-    searched = world(NODE), draws(SEARCH_DRAWS, 1), draws(JUDGE_DRAWS, 2)
+    searched = world(NODE), LINKS.draws(SEARCH_DRAWS, 1), LINKS.draws(JUDGE_DRAWS, 2)
     return {name: worst_disturbance(item, *searched, ENERGIES) for name, item in filters(NODE, designs).items()}

@@ -56,10 +56,12 @@ def node_designs(setting: Setting, node: int) -> NodeDesigns:
     """All of one node."""
     system, level = setting.system(node), setting.levels[node]
     start = setting.initial * np.eye(4)
+    # The recursion (32) at the paper's level, by what picks one of its solutions.
     tried = {o: hg.h_infinity.recursive_design(system, level, start, o, search=False) for o in (*OBJECTIVES, "none")}
     paper, horizon = tried["trace"], hg.h_infinity.horizon_design(system)
     if not paper.feasible:
         raise fail(f"design of node {node + 1}", "one that is feasible at the paper's level", paper.status)
+    # And at its smallest level, over the whole horizon, and with K = 0.
     return NodeDesigns(
         paper,
         certify(system, paper),

@@ -15,6 +15,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph_studies import check_fields
+from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws
 
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2")
@@ -162,6 +163,17 @@ class Setting:
         """With white noises as strong as C rho_s in the mean over the horizon: what Kalman filters believe."""
         powers = np.array(self.noise_gain) ** 2 * np.mean(self.channel_noises**2, axis=0)
         return self.channel([float(p) for p in powers], hop)
+
+    def draws(self, count: int, seed: int) -> Draws:
+        """Arrivals of `count` runs as gains, sqrt(E1 E2) b1 b2 y + sqrt(E2) b2 n1 + n2 and sqrt(E3) b3 y + n3."""
+        arrived = np.random.default_rng(seed).random((count, self.steps, 3)) < self.arrival
+        first, second, direct = np.moveaxis(arrived.astype(float), -1, 0)
+        zero, item = np.zeros_like(first), np.ones_like(first)
+        c, e = self.noise_gain, np.sqrt(self.powers)
+        gain = np.stack([e[0] * e[1] * first * second, e[2] * direct], axis=-1)[..., None]
+        relayed = np.stack([e[1] * second * c[0], c[1] * item, zero], axis=-1)
+        straight = np.stack([zero, zero, c[2] * item], axis=-1)
+        return Draws(gain, np.stack([relayed, straight], axis=-2))
 
     def system(
         self, node: int, growth: Constant | tuple[Constant, Constant] | None = None, hop: Hop | None = None

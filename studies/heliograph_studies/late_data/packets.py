@@ -93,6 +93,7 @@ def statistics(packets: Packets) -> Statistics:
     """Of a network's packets."""
     fates = [np.isnan(fate) for fate in packets.fates()]
     runs = np.concatenate([_runs(lost) for lost in fates])
+    # Losses after a loss: each packet and the next of one boot.
     before, after = (np.concatenate([lost[part] for lost in fates]) for part in (slice(None, -1), slice(1, None)))
     local = packets.among(packets.first_received())
     by_node = [local.sent[local.node == node] for node in np.unique(local.node)]

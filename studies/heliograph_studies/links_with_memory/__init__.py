@@ -143,6 +143,7 @@ def scores(
         "imm": hg.filters.imm_filter(*model),
         "gpb2": hg.filters.gpb2_filter(*model),
     }
+    # Where the mode is not observed, one step late, and at once.
     places: Places = {
         "nothing known": (channel, {**linear, **weighing}),
         "late": (hg.model.with_flag(channel, late=True), {"mode_late": hg.filters.mode_late_filter(*model)}),
@@ -152,6 +153,7 @@ def scores(
     result = simulated(plant, sensor, places, which, setting.runs, setting.seed, progress)
     particles = {"particles": (channel, {"particle": hg.filters.particle_filter(*model)})}
     result |= simulated(plant, sensor, particles, which, setting.particle_runs, setting.seed, progress)
+    # Errors before any data, of filters whose gains depend on none.
     for name, item in linear.items():
         truth = hg.filters.true_error(item, *model, horizon)
         result[name] = Known(**vars(result[name]), true_before_data=float(truth.true[begin:, 0, 0].mean()))

@@ -197,8 +197,10 @@ def _phase(voltages: np.ndarray, start: np.ndarray, load: Mapping[str, float], d
         ode_solver=solver,
         tau=STEP,
     )
+    # From the states of the phase before.
     system.reset()
     solver.set_initial_value(start, 0.0)
+    # Each step's voltage as duty cycles of the three phases.
     axes = 2 * np.pi / 3 * np.arange(3)
     phases = voltages @ np.stack([np.cos(axes), np.sin(axes)])
     states = []

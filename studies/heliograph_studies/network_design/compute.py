@@ -45,6 +45,7 @@ def circuit() -> Circuit:
         start.update(gains)
         return float(np.trace(hg.relays.periodic_behind_relays(network, gains), axis1=1, axis2=2).sum())
 
+    # Secant steps on the error over 1 / share of the power, until it is the published one.
     tried = [(1.0, error(1.0)), (2.0, error(0.5))]  # by 1 / share, in which the error is nearly a line
     while abs(tried[-1][1] / published - 1) > CLOSE:
         (a, low), (b, high) = tried[-2:]

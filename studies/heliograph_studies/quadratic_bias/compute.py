@@ -1,6 +1,5 @@
 """All numbers of the reproduction: designed covariances, Monte Carlo on the library's driver, bounds, one run."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,15 +135,12 @@ def design(model: Model, resolution: float) -> Designs:
     printed = printed_quadratic(*parts, model.horizon)
     filters[TRUE] = PolynomialFilter(ScheduledFilter(printed.schedule), 2)
     filters["mixture"] = hg.filters.mixture_filter(*parts, resolution)
-    covariance = _covariances(model, schedules | {"memory": memory}, printed)
-    return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
-
-
-def _covariances(model: Model, schedules: Mapping[str, Schedule], printed: Printed) -> dict[str, np.ndarray]:
-    start = first(model.plant).initial_covariance[None]
-    steps = {name: schedule.gains.covariance for name, schedule in schedules.items()}
+    # What is known before any run, from the covariance of the initial state on.
+    steps = {name: schedule.gains.covariance for name, schedule in (schedules | {"memory": memory}).items()}
     steps |= {CLAIMED: printed.schedule.gains.covariance, TRUE: printed.true_covariance}
-    return {name: np.concatenate([start, value]) for name, value in steps.items()}
+    start = first(model.plant).initial_covariance[None]
+    covariance = {name: np.concatenate([start, value]) for name, value in steps.items()}
+    return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
 
 
 def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -> Numbers:
@@ -157,8 +153,10 @@ def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -
     def named(values: np.ndarray, suffix: str = "") -> dict[str, float]:
         return {f"{state}{suffix}": value.tolist() for state, value in zip(model.states, values, strict=True)}
 
+    # Designed: variances over time, and their means over the steps that count.
     variances = {name: np.diagonal(value, axis1=1, axis2=2) for name, value in designs.covariance.items()}
     means = {name: value[model.begin + 1 :].mean(axis=0) for name, value in variances.items()}
+    # Simulated on the same runs, and their differences to the linear filter.
     squares = {name: _mean_square(part, None, model.begin) for name, part in sums[NODE].items()}
     simulated: dict[str, dict[str, Any]] = {}
     for name, part in sums[NODE].items():

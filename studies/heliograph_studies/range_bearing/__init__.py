@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import heliograph as hg
 from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION
-from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields
+from heliograph_studies import Inline, Stages, Study, Unlisted, check_fields, sampled
 from heliograph_studies.curves import Curve, Panel, curves_over, paths
 
 SPEED, TURN = 1.0, 0.02  # m and rad a step
@@ -65,10 +65,12 @@ def passing(setting: Setting, side: float, circular: bool = True) -> hg.Network:
         inputs=("distance", "turn"),
         circular=["heading"] if circular else [],
     )
+    # One sensor, seen through quiet noise or through noise in bursts.
     angles = ["bearing"] if circular else []
     sensor = hg.Sensor(look, np.diag([0.5**2, setting.bearing**2]), outputs=("range", "bearing"), circular=angles)
     direct = hg.cubature_filter(plant, sensor, QUIET)
     noisy = hg.cubature_filter(plant, sensor, LINK)
+    # Filters of each node, and both nodes together.
     quiet: dict[str, hg.filters.AbstractFilter] = {
         "cubature": direct,
         "extended": hg.extended_filter(plant, sensor, QUIET),
@@ -102,8 +104,10 @@ def close_by(setting: Setting) -> hg.Network:
         states=("x", "y", "vx", "vy"),
     )
     sensor = hg.Sensor(look, np.diag([1.0, setting.bearing**2]), outputs=("range", "bearing"), circular=["bearing"])
+    # The range fades over two hops, the bearing does not.
     relay = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), 0.02) for _ in range(2)])
     channel = hg.parallel([relay, hg.hop(1.0, 1e-4)])
+    # Moments by rules of higher degree.
     rules = {"second_order": 2, "four_points": 3, "seven_points": 6}  # degree; but for 2 one point more a direction
     filters: dict[str, hg.filters.AbstractFilter] = {
         "extended": hg.extended_filter(plant, sensor, channel),
@@ -203,9 +207,7 @@ def driven(
 
 def nees_of(errors: np.ndarray, estimate: hg.model.Estimate) -> np.ndarray:
     """e' B^-1 e / n, (run, time)."""
-    weighed = np.linalg.solve(np.asarray(estimate.covariance), errors[..., None])[..., 0]
-    result: np.ndarray = np.sum(errors * weighed, axis=-1) / errors.shape[-1]
-    return result
+    return np.asarray(hg.nees(errors, np.zeros_like(errors), estimate.covariance) / errors.shape[-1])
 
 
 def score(errors: np.ndarray, nees: np.ndarray) -> Score:
@@ -217,7 +219,7 @@ def score(errors: np.ndarray, nees: np.ndarray) -> Score:
         median=float(np.median(place)),
         largest=float(place.max()),
         nees=float(nees.mean()),
-        nees_se=float(nees.mean(axis=1).std(ddof=1) / np.sqrt(runs)),
+        nees_se=sampled(nees.mean(axis=1)).error,
         inside=float(np.mean(np.abs(nees.mean(axis=0) - 1) <= reach)),
     )
 
@@ -227,6 +229,7 @@ def tails(setting: Setting, progress: Callable[[int, int], None]) -> dict[str, T
     network = close_by(setting)
     record = hg.monte_carlo(network, setting.fading_steps, setting.fading_runs, setting.seed, progress=progress)
     assert record.truth is not None
+    # Runs in order of their closest pass, in classes of one size.
     distance = np.hypot(record.truth[..., 0], record.truth[..., 1])
     nearest, order = distance.argmin(axis=1), np.array_split(np.argsort(distance.min(axis=1)), CLASSES)
     result = {}
@@ -234,6 +237,7 @@ def tails(setting: Setting, progress: Callable[[int, int], None]) -> dict[str, T
         errors = record.errors("station", name)
         nees, place = nees_of(errors, estimate), np.sum(errors[..., :2] ** 2, axis=-1)
         by_run = np.sort(place.mean(axis=1))[::-1]
+        # Steps at which the claim is far too small.
         beyond = nees > 23.51 / 4  # chi-square with 4 degrees of freedom: one in 10,000
         broken = beyond.any(axis=1)
         near = np.abs(beyond.argmax(axis=1) - nearest) <= 3

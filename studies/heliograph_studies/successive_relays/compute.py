@@ -51,6 +51,7 @@ def recursion(misprint: str, horizon: int, setting: Setting) -> Recursion:
     K_all, L_all, relay, remote = [], [], [[np.trace(P)] * 2], [np.trace(P)]
     v, m_3 = setting.spread, setting.means[2]
     for k in range(1, horizon + 1):
+        # The relay that receives: the covariance of its innovation, and its gain (30).
         i, j = (0, 1) if k % 2 == 0 else (1, 0)
         m, d = setting.means[i], setting.means[3 + j]
         Cij = C if i == 0 else C.T
@@ -60,10 +61,12 @@ def recursion(misprint: str, horizon: int, setting: Setting) -> Recursion:
         al = al - _twice(m_3 * Gb @ Cij @ Psi.T)
         wrong = X[i] if misprint == "theorem_1" else Cij
         K = (Gam @ (X[i] @ Gb.T - m_3 * wrong @ Psi.T) + m * Q @ Psi.T) @ np.linalg.inv(Gb @ X[i] @ Gb.T + al)
+        # The remote filter: the same, and its gain (31).
         square = v**2 if misprint == "lemma_7" else d**2
         Re = v * Pi - square * _twice(Pm[j]) + (v + d**2) * X[j] - v * _twice(Xx[j])
         Ok = d**2 * Psi @ P @ Psi.T + Psi @ Re @ Psi.T + G
         L = d * Gam @ (P - Pm[j]) @ Psi.T @ np.linalg.inv(Ok)
+        # Covariances of all errors, and of errors with the state, at k.
         A, B, KP, LP = Gam - K @ Gb, Gam - d * L @ Psi, K @ Psi, L @ Psi
         P_next = B @ P @ B.T + LP @ Re @ LP.T + _twice(d * Gam @ Pm[j] @ LP.T) + Q + L @ G @ L.T
         first = Gam - LP if misprint == "lemma_6_sign" else B  # delta_i + delta_j = 1 for its mean d

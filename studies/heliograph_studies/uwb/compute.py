@@ -72,6 +72,7 @@ def power(drive: Drive) -> Power:
     """The fading law of a drive's received power, by `fit`, over the reference's distances."""
     time, ranges, _ = slots(drive)
     place = np.column_stack([np.interp(time, drive.truth_time, drive.truth[:, i]) for i in (0, 1)])
+    # Distances of the true places, and the power of each range beside them.
     apart = np.column_stack([place, np.full(len(place), HEIGHT)])[:, None] - drive.places
     distance = np.linalg.norm(apart, axis=2)
     rssi = np.full(ranges.shape, np.nan)
@@ -80,6 +81,7 @@ def power(drive: Drive) -> Power:
     rssi[(distance < NEAR) | np.isnan(ranges)] = np.nan
     count = len(drive.places)
 
+    # Level and exponent as free numbers of a sensor whose input is -10 log10(distance).
     def network() -> hg.Network:
         plant = hg.LinearPlant(
             np.zeros((count, count)), np.zeros((count, count)), np.zeros(count), np.zeros((count, count)), np.eye(count)
@@ -190,7 +192,7 @@ def judged(rule: str, drive: Drive, numbers: Numbers) -> Rule:
     # The place that a range is of lies before its stamp; the place at the stamp is predicted.
     error = off(read.time - numbers.late, place)
     ahead = place + numbers.late * np.gradient(place, np.maximum.accumulate(read.time), axis=0)
-    squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[used]), error)
+    squared = hg.nees(error, np.zeros_like(error), covariance[used])
     summaries = summarise_innovations(Weighed(innovation, variance, weight))
     return Rule(
         _rms(error), float(squared.mean() / 2), _rms(off(read.time, ahead)), numbers, read.time[used], place[used],

@@ -116,6 +116,7 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
     """The extended filter of a rule, with these numbers, from a place; its input is the time since the step before."""
     count = len(anchors)
 
+    # A walk of the speed in the plane.
     def move(x: jax.Array, u: jax.Array) -> jax.Array:
         return jnp.concatenate([x[:2] + u[0] * x[2:], x[2:]])
 
@@ -134,6 +135,7 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
         inputs=("dt",),
     )
 
+    # Ranges to the anchors, and errors with memory as states.
     def ranges(x: jax.Array) -> jax.Array:
         across = jnp.sqrt((x[0] - anchors[:, 0]) ** 2 + (x[1] - anchors[:, 1]) ** 2 + (HEIGHT - anchors[:, 2]) ** 2)
         result: jax.Array = across + numbers.excess

@@ -107,9 +107,11 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
     net, places = network(setting), positions(setting)
     near = hg.fusion.neighbours_within(places, setting.radius)
     scale = centre(net, setting.steps)
+    # Exact errors given what arrives, the least possible, and simulated errors over claims.
     exact = stages("errors before any data", lambda: before_data(net, setting))
     bound = stages("the bound", lambda: least(net, setting))
     nees = stages("simulated runs", lambda: simulated(net, setting))
+    # Means over the second half, in units of a centre's.
     half, rules = slice(setting.steps // 2, None), {}
     for name, (error, claimed) in exact.items():
         means = float(error[half].mean() / scale), float(claimed[half].mean() / scale)

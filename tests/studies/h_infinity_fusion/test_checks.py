@@ -65,7 +65,7 @@ def test_the_search_finds_the_norm_of_a_linear_system():
         lambda x, k: rotation @ x, lambda x: x[:1], discriminating.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
         discriminating.inputs("bias"),
     )  # fmt: skip
-    draws = discriminating.draws(2, 0)
+    draws = discriminating.LINKS.draws(2, 0)
     result = worst_disturbance.worst_disturbance(item, world, draws, draws, [1.0], rounds=200)
     powers = [np.linalg.matrix_power(rotation, k) for k in range(steps)]
     push = discriminating.DISTURBANCE
@@ -98,7 +98,7 @@ def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_shou
 
 def kalman(node):
     believed, sensor = discriminating.plant(False), discriminating.sensor(node)
-    return example.prediction_of(hg.extended_filter(believed, sensor, discriminating.channel()))
+    return example.prediction_of(hg.extended_filter(believed, sensor, discriminating.LINKS.unit_channel()))
 
 
 @pytest.mark.parametrize("runs", [0, 99, 100.5])

@@ -235,13 +235,14 @@ class Writer:
 
     def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
         """Write a loop that ends when no lane's condition holds."""
-        check = next(
-            i for i, statement in enumerate(loop.body.items) if isinstance(statement, Check) and statement.loop is loop
-        )
+        # The body up to the loop's check, and what follows it in a turn.
+        checks = (i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
+        check = next(checks)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
         self.block(head)
         assert loop.condition is not None
+        # Another turn if some lane needs it.
         some = self._any(loop.condition)
         self.line(f"br i1 {some}, label %{name}.turn, label %{name}.end")
         self.start(f"{name}.turn")

@@ -43,6 +43,15 @@ def event_filter(
     Claim: "exact" behind a `StochasticTrigger` without losses, or with losses that are known, and behind `Periodic`,
     where plant and sensor are linear and no gain is random; else "nominal".
 
+    Args:
+        plant: linear or not; it may vary over time.
+        sensor: whose components are sent.
+        channel: link of the sender, with its losses.
+        trigger: rule by which the sender sends.
+        known: number of Gaussians where the reference is the value that came last (default 3).
+        lost: number of Gaussians where it may be a value that was lost (default 2).
+        transform: of moments, for a plant or sensor that is not linear (default `Cubature()`).
+
     Raises:
         ValueError: parts that do not fit, angles, a link whose memory drifts or whose delays are not 0, several
             components that are each sent alone through links that are not lost one by one.

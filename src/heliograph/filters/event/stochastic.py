@@ -111,10 +111,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             parts.append(_alone(jnp.zeros(()), prior, state.law).labelled(0, state.law[None] * lost))
         if len(down):
             up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [
-                parts[0].times(up),
-                *(hypothesis.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for hypothesis in parts[1:]),
-            ]
+            parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
         nothing = join(together(parts))
 
         there = jnp.any(~jnp.isnan(values))

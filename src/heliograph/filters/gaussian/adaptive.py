@@ -191,7 +191,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
         memory: share of what was learned that a step leaves, over 0 and at most 1 (never forget); a variance is known
-            from some 1 / (1 - memory) values.
+            from some 1 / (1 - memory) values (default 0.98).
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].

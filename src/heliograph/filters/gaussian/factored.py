@@ -50,10 +50,8 @@ def gain_spread(channel: SecondOrder | OverTime) -> np.ndarray | OverTime:
     # One set of operators per step, padded with zeros to the same number.
     if isinstance(channel, OverTime):
         parts = [np.asarray(gain_spread(step)) for step in unstack(channel)]
-        most = max(len(operators) for operators in parts)
-        return OverTime(
-            np.stack([np.pad(operators, [(0, most - len(operators)), (0, 0), (0, 0)]) for operators in parts])
-        )
+        most = max(len(k) for k in parts)
+        return OverTime(np.stack([np.pad(k, [(0, most - len(k)), (0, 0), (0, 0)]) for k in parts]))
     if channel.uncertain:
         raise fail("single precision", "a channel whose probabilities are known", "uncertain ones")
     # Entries of H that vary, and how a pair's moment divides between (a, b) and (b, a).

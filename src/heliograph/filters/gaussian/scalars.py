@@ -107,21 +107,15 @@ def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> 
 
 
 def _root_ratio(
-    numerator: jax.Array,
-    by_numerator: list[jax.Array],
-    denominator: jax.Array,
-    by_denominator: Sequence[jax.Array | None],
+    top: jax.Array, by_top: list[jax.Array], bottom: jax.Array, by_bottom: Sequence[jax.Array | None]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Half of log(numerator / denominator), at least log SMALLEST_SCALAR, also where both are zero.
+    """Half of log(top / bottom), at least log SMALLEST_SCALAR, also where both are zero.
 
     Returned with its slopes, from those of both. No quotient or root of zero is taken, so that derivatives exist.
     """
-    some = (numerator > 0) & (denominator > 0)
-    numerator, denominator = jnp.where(some, numerator, 1.0), jnp.where(some, denominator, 1.0)
-    value = jnp.log(numerator / denominator) / 2
+    some = (top > 0) & (bottom > 0)
+    top, bottom = jnp.where(some, top, 1.0), jnp.where(some, bottom, 1.0)
+    value = jnp.log(top / bottom) / 2
     free = some & (value > np.log(SMALLEST_SCALAR))
-    slopes = [
-        p / numerator if w is None else p / numerator - w / denominator
-        for p, w in zip(by_numerator, by_denominator, strict=True)
-    ]
+    slopes = [p / top if w is None else p / top - w / bottom for p, w in zip(by_top, by_bottom, strict=True)]
     return jnp.where(free, value, np.log(SMALLEST_SCALAR)), [jnp.where(free, slope / 2, 0.0) for slope in slopes]

@@ -84,6 +84,9 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
 
     Claim: "exact" if every part is, else "nominal".
 
+    Args:
+        filters: one for each node, of one plant.
+
     Raises:
         ValueError: no filters, or filters of different state dimensions.
 

@@ -53,26 +53,24 @@ def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
         # z = g H y + n: every gain with every noise.
         case GainAndNoise():
             gains, noises = _gain_atoms(channel.law), _noise_atoms(channel.noise)
-            components = [
-                Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises
-            ]
+            atoms = [Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises]
         # One map after another: G_2 (G_1 y + n_1) + n_2.
         case Series():
-            components = atoms_of(channel.maps[0])
+            atoms = atoms_of(channel.maps[0])
             for affine in channel.maps[1:]:
-                components = _combine(components, atoms_of(affine), _after)
+                atoms = _combine(atoms, atoms_of(affine), _after)
         # Maps of the same signal, stacked.
         case Stack():
-            components = atoms_of(channel.maps[0])
+            atoms = atoms_of(channel.maps[0])
             for affine in channel.maps[1:]:
-                components = _combine(components, atoms_of(affine), _others)
+                atoms = _combine(atoms, atoms_of(affine), _others)
         # One of several maps, drawn: p(i) times the atoms of map i.
         case Mixture():
             weighted = zip(channel.choice.probabilities, channel.maps, strict=True)
-            components = [c._replace(weight=p * c.weight) for p, affine in weighted for c in atoms_of(affine)]
+            atoms = [c._replace(weight=p * c.weight) for p, affine in weighted for c in atoms_of(affine)]
         case _:
             raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(channel).__name__)
-    return components
+    return atoms
 
 
 def _combine(

@@ -151,13 +151,10 @@ def _share(square: jax.Array, column: int) -> jax.Array:
     scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
     others = [i for i in range(square.shape[0]) if i != column]
-    among, to_others = (
-        correlations[jnp.ix_(jnp.array(others), jnp.array(others))],
-        correlations[jnp.array(others), column],
-    )
+    among, r = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), column]
     values, vectors = eigh(among)
     used = values > RANK * values[-1]
-    known = jnp.sum(jnp.where(used, (vectors.T @ to_others) ** 2 / jnp.where(used, values, 1.0), 0.0))
+    known = jnp.sum(jnp.where(used, (vectors.T @ r) ** 2 / jnp.where(used, values, 1.0), 0.0))
     return jnp.where(size[column] > 0, 1 - known, 0.0)
 
 

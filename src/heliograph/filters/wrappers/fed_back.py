@@ -69,6 +69,9 @@ def prediction_of(filter: AbstractFilter) -> PredictionFilter:
 
     Claim: that of `filter`, a `GaussianFilter`.
 
+    Args:
+        filter: whose prediction is the estimate.
+
     Raises:
         ValueError: a filter that is not Gaussian.
 

@@ -59,11 +59,9 @@ def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
     parts = [sensor for sensor in sensors.values() if isinstance(sensor, LinearSensor)]
     if len(parts) < len(sensors):
         return joint_sensor(sensors)
-    matrices = [sensor.matrix for sensor in parts]
-    outputs = [f"{name}_{output}" for name, sensor in zip(sensors, parts, strict=True) for output in sensor.outputs]
-    return LinearSensor(
-        library(matrices).concatenate(matrices), Independent([sensor.noise for sensor in parts]), outputs
-    )
+    matrices = [s.matrix for s in parts]
+    outputs = [f"{name}_{output}" for name, s in zip(sensors, parts, strict=True) for output in s.outputs]
+    return LinearSensor(library(matrices).concatenate(matrices), Independent([s.noise for s in parts]), outputs)
 
 
 def _joint_channel(channel: Channel) -> Channel:

@@ -216,9 +216,9 @@ def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts
 
 def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
     total, pits, start = np.zeros(len(z)), [], 0
-    for i, mixture in enumerate(parts):
-        stop = start + mixture.gain.shape[1]
-        weight, error, root = _weighed(y, spread, z[:, start:stop], mixture)
+    for i, law in enumerate(parts):
+        stop = start + law.gain.shape[1]
+        weight, error, root = _weighed(y, spread, z[:, start:stop], law)
         for j in range(stop - start):
             now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
             pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
@@ -226,43 +226,35 @@ def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tu
         total += last
         if i + 1 < len(parts):
             y, spread = _corrected(
-                y, spread, z[:, start:stop], mixture, np.exp(weight[..., -1] - last[:, None]), error, root
+                y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]), error, root
             )
         start = stop
     return total, np.stack(pits, axis=1)
 
 
-def _weighed(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, mixture: Part
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
     there = ~np.isnan(z)[:, None]
     both = there[..., None] & there[..., None, :]
-    total = np.einsum("amp,tpq,anq->tamn", mixture.gain, spread, mixture.gain) + mixture.noise
+    total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
     total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
     root = np.linalg.cholesky(total)
-    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", mixture.gain, y) - mixture.offset, 0.0)
+    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     error = np.linalg.solve(root, value[..., None])[..., 0]
     scale = np.diagonal(root, axis1=-2, axis2=-1)
     density = np.where(there, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
-    weight = mixture.log_weight[:, None] + np.concatenate(
+    weight = law.log_weight[:, None] + np.concatenate(
         [np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2
     )
     return weight, error, root
 
 
 def _corrected(
-    y: np.ndarray,
-    spread: np.ndarray,
-    z: np.ndarray,
-    mixture: Part,
-    weight: np.ndarray,
-    error: np.ndarray,
-    root: np.ndarray,
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part, weight: np.ndarray, error: np.ndarray, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""
     there = ~np.isnan(z)[:, None, :, None]
-    cross = np.where(there, np.einsum("amp,tpq->tamq", mixture.gain, spread), 0.0)
+    cross = np.where(there, np.einsum("amp,tpq->tamq", law.gain, spread), 0.0)
     white = np.linalg.solve(root, cross)  # L^-1 G P
     moved = np.einsum("tamq,tam->taq", white, error)
     shift = np.einsum("ta,taq->tq", weight, moved)

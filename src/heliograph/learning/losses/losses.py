@@ -115,7 +115,7 @@ def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict
 
     Args:
         fates: {name: fates}, as `fates_by_node` and `fates_by_hop` give them.
-        held_out: share of the packets that choose, as in `learn_losses`.
+        held_out: share of the packets that choose, as in `learn_losses` (default 1/3).
 
     Raises:
         ValueError: as `learn_losses`.

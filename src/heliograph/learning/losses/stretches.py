@@ -151,10 +151,8 @@ def as_fates(value: object) -> Fates:
     """
     listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
     items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
-    several = len(items) > 0 and all(rank("fates", single) == 1 for single in items)
-    parts = [
-        array("fates", single, (None,), missing=True) for single in (items if several else [cast(ArrayLike, value)])
-    ]
+    several = len(items) > 0 and all(rank("fates", x) == 1 for x in items)
+    parts = [array("fates", x, (None,), missing=True) for x in (items if several else [cast(ArrayLike, value)])]
     for stretch in parts:
         if np.any((stretch != 0) & (stretch != 1) & ~np.isnan(stretch)):
             raise fail(

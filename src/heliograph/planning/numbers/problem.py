@@ -282,9 +282,7 @@ class NumberProblem:
         sharp = self.criterion if criterion is None else criterion
         key = x.tobytes(), sharp.sharpness
         if key not in self._last:
-            system = ModeSystem(
-                *(None if values is None else np.asarray(values) for values in self._system(np.asarray(x)))
-            )
+            system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
             if system.start is None:
                 scale = np.sqrt(1 + np.ravel(self.numbers.named(x)[YOUNG])[0]) if self.young else 1.0
                 check_stable(system.transition[0] / scale)

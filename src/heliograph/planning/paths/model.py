@@ -178,7 +178,7 @@ def independent_paths(
         alpha: Var m / E g^2 of each hop, the noise in units of sent power, shaped likewise.
         error: over which steps: steady unless it has a period or a horizon.
         initial_mean: mean of x_0, shape (n,), zero unless given; used over a horizon.
-        initial_covariance: covariance of x_0, shape (n, n), needed over a horizon.
+        initial_covariance: covariance of x_0, shape (n, n), needed over a horizon (default none).
         transmitters: names of the transmitters, "sender0" and so on unless given.
 
     Returns:

@@ -205,6 +205,9 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
     probabilities have their maxima.
 
+    Args:
+        channel: one that forgets.
+
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """
@@ -342,10 +345,8 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
-        QuadraticMap(
-            sum(q.center for q in quadratics) + apart * center, sum(q.radius for q in quadratics) + apart * radius
-        )
-        for quadratics, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+        QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
+        for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
 
 

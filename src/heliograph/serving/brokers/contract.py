@@ -37,8 +37,8 @@ def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0)
 
     Args:
         broker: both sides of the broker to examine.
-        messages: number of messages sent in each part of the check.
-        patience: seconds that a single call may take at most.
+        messages: number of messages sent in each part of the check (default 100).
+        patience: seconds that a single call may take at most (default 20).
 
     Returns:
         Whether redelivered messages arrive in order. If not, the window of a service has to be longer than a redelivery
@@ -130,9 +130,12 @@ class _Check:
         async def listen() -> None:
             while set(bodies) - set(received):
                 received.extend(await self._taken(await transport.receive(), acknowledge))
+                await asyncio.sleep(0)  # a transport that never waits would let no time pass
 
+        # A timeout, and not `wait_for`: Python 3.11's may lose the cancellation of what waits inside, and never end.
         try:
-            await asyncio.wait_for(listen(), self.patience)
+            async with asyncio.timeout(self.patience):
+                await listen()
         except TimeoutError:
             missing, total = len(set(bodies) - set(received)), len(bodies)
             what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
@@ -142,9 +145,11 @@ class _Check:
     async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
         """Receive for `silence` seconds, then cancel; return the bodies that arrived."""
         try:
-            return await self._taken(await asyncio.wait_for(transport.receive(), self.silence), acknowledge)
+            async with asyncio.timeout(self.silence):
+                batch = await transport.receive()
         except TimeoutError:
             return []
+        return await self._taken(batch, acknowledge)
 
     async def _silent(self, transport: Transport) -> None:
         """Receive and acknowledge late copies until none arrive."""
@@ -162,7 +167,8 @@ class _Check:
 
     async def _soon(self, what: str, waiting: Awaitable[T]) -> T:
         try:
-            return await asyncio.wait_for(waiting, self.patience)
+            async with asyncio.timeout(self.patience):
+                return await waiting
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 

@@ -110,9 +110,7 @@ class Carrier:
             self._say(f"{what}: {line}")
 
     def _goes_on(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        shapes = [
-            {path: leaf[0] for path, leaf in columns.get(name, {}).items()} for columns in (self._old["filters"], new)
-        ]
+        shapes = [{path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)]
         return shapes[0] == shapes[1]
 
     def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:

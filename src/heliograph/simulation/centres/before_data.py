@@ -102,13 +102,11 @@ class CrossCovariances:
         return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
 
 
-def _weights(shared: np.ndarray, independent: np.ndarray) -> Float[np.ndarray, "n node n"]:
-    scale = np.sqrt(np.einsum("iaa->ia", independent) + np.einsum("ias,ias->ia", shared, shared))
+def _weights(shared: np.ndarray, apart: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", apart) + np.einsum("ias,ias->ia", shared, shared))
     scale = np.where(scale > 0, scale, 1.0)
-    least = np.linalg.eigvalsh(independent / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(
-        factored_weights(shared, independent) if least > REGULAR else matrix_weights(joint_of(shared, independent))
-    )
+    least = np.linalg.eigvalsh(apart / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, apart) if least > REGULAR else matrix_weights(joint_of(shared, apart)))
 
 
 def cross_covariances(

@@ -253,9 +253,7 @@ def dataset_of(
 def claims_text(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Claims for people: `node/filter: claim`."""
     return visible(
-        ", ".join(
-            f"{node}/{name}: {single.claim}" for node, by_name in results.items() for name, single in by_name.items()
-        )
+        ", ".join(f"{node}/{name}: {single.claim}" for node, of in results.items() for name, single in of.items())
     )
 
 

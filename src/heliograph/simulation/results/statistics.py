@@ -181,6 +181,9 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     Runs stay the unit of independence, so errors that nodes share are counted as shared. `statistics` are those of the
     nodes, of the same runs.
 
+    Args:
+        statistics: those of the nodes, of the same runs.
+
     Raises:
         ValueError: nothing to pool, or statistics of different runs.
     """

@@ -80,19 +80,15 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
         def of(name: str) -> np.ndarray:
             """Return sums of pairs i <= j as symmetric matrices."""
-            return filled(
-                batch, sizes, (n, n), [(position, matrices(getattr(score, name))) for position, score in every]
-            )
+            return filled(batch, sizes, (n, n), [(at, matrices(getattr(s, name))) for at, s in every])
 
         # Figures over time: squared errors, claimed variances, NEES, failures.
         squares = [(position, np.diagonal(score.actual(), axis1=-2, axis2=-1)) for position, score in every]
-        claimed = [(position, np.diagonal(score.claimed(), axis1=-2, axis2=-1)) for position, score in every]
-        sums = [(position, score.nees) for position, score in every]
-        distances = [(position, score.nees.sum(axis=0) / score.runs / n) for position, score in every]
-        by_step = [
-            (position, np.full(steps, np.nan) if score.failed is None else score.failed) for position, score in every
-        ]
-        failed = [(position, np.array(score.failed_runs)) for position, score in every]
+        claimed = [(at, np.diagonal(s.claimed(), axis1=-2, axis2=-1)) for at, s in every]
+        sums = [(at, s.nees) for at, s in every]
+        distances = [(at, s.nees.sum(axis=0) / s.runs / n) for at, s in every]
+        by_step = [(at, np.full(steps, np.nan) if s.failed is None else s.failed) for at, s in every]
+        failed = [(at, np.array(s.failed_runs)) for at, s in every]
         filters_of = ["node", "filter"]
         uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
         # Sums by batch, from which the statistics can be restored, then figures.

@@ -125,8 +125,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             statistics[node] = {
-                name: _statistics(count, [values[node][name] for values in items], claim)
-                for name, claim in claims.items()
+                name: _statistics(count, [v[node][name] for v in items], claim) for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
             fused = statistics[FUSED][name]

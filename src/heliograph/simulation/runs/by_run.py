@@ -56,11 +56,9 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    example = [leaf[0] for leaf in leaves]
+    some = [leaf[0] for leaf in leaves]
     # Which results depend on values of single runs.
-    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
-        *example
-    )
+    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*some)
     expected = range(len(traced.jaxpr.outvars))
     tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in expected])[1]) for i in expected]
     # The axis of runs last inside, first outside.

@@ -18,6 +18,9 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
     changed. Stored programs are executed: the folder is made for its user alone, and closed to others where it was
     open.
 
+    Args:
+        folder: for the programs (default: heliograph/compilations in the user's cache folder).
+
     Raises:
         ValueError: a folder that cannot be made, or that belongs to another user; no folder, and no home.
     """

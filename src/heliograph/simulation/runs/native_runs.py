@@ -68,12 +68,8 @@ def natively(
 
 def _is_apart(network: Network) -> bool:
     """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
-    estimating = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    return (
-        len(estimating) == len(network.nodes)
-        and not network.fused
-        and not any(first(n.channel).remembers for n in estimating)
-    )
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
+    return len(nodes) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in nodes)
 
 
 def _parts(network: Network) -> Iterator[Network]:
@@ -87,13 +83,8 @@ def _code(
     network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], smoothing: Part | None = None
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
-    return native(
-        World(network.plant, medium_of(network), filters),
-        inputs,
-        key,
-        reducer,
-        smoothing and smoothing.smoother(filters),
-    )
+    world = World(network.plant, medium_of(network), filters)
+    return native(world, inputs, key, reducer, smoothing and smoothing.smoother(filters))
 
 
 def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
