@@ -9,7 +9,7 @@ from heliograph.cli import main
 from heliograph.live.timeline import Timeline
 from heliograph.report.figures import svg
 from heliograph_studies.demo.recording import read_recording
-from heliograph_studies.late_data import Setting, example, plaza
+from heliograph_studies.late_data import Setting, example, figures, plaza
 from heliograph_studies.late_data.compute import Outcome, Trace, through_moving, through_plaza
 from heliograph_studies.late_data.packets import SLOT, Packets, read_trace, statistics, synthetic_packets
 from heliograph_studies.late_data.plaza import fates_by_node

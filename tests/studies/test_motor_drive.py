@@ -12,7 +12,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.numerics.extras import how_to_install
 from heliograph_studies import motor_drive
-from heliograph_studies.motor_drive import compute, listeners, machine
+from heliograph_studies.motor_drive import compute, machine
 from heliograph_studies.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
 
 needs_simulator = pytest.mark.skipif(
@@ -134,13 +134,13 @@ def test_scores_of_made_up_errors():
 
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     truth = np.tile(RUNNING[:5] / RATED[:5], (4000, 1))
-    result = listeners.received(truth, 0)
+    result = compute.received(truth, 0)
     means = {"relay_1": 0.865 * 0.93, "relay_2": 0.79 * 0.93, "wired": 1.0}
     for node, gain in means.items():
         error = result[node].std(axis=0) / np.sqrt(4000)
         assert np.all(np.abs(result[node].mean(axis=0) - gain * RUNNING[:2]) < 4 * error), node
-    assert np.array_equal(result["relay_1"], listeners.received(truth, 0)["relay_1"])
-    assert not np.array_equal(result["relay_1"], listeners.received(truth, 1)["relay_1"])
+    assert np.array_equal(result["relay_1"], compute.received(truth, 0)["relay_1"])
+    assert not np.array_equal(result["relay_1"], compute.received(truth, 1)["relay_1"])
 
 
 def test_a_missing_simulator_is_said_before_the_work_starts(tmp_path, monkeypatch):

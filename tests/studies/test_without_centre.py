@@ -43,7 +43,7 @@ def test_the_page_shows_every_figure_and_rule(outcome, fits):
     html = without_centre.example.make_page(without_centre.Setting(), outcome, {}, pictures).html()
     fits(html)
     assert html.count("data:image/svg+xml") == len(drawn) == 2
-    assert all(label in html for label, _ in without_centre.RULES.values())
+    assert all(label in html for label, _ in without_centre.NAMES.values())
 
 
 @pytest.mark.slow

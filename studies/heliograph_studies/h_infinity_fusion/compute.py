@@ -14,13 +14,18 @@ from heliograph_studies.h_infinity_fusion.example import (
     MORE_QUANTIZERS,
     QUANTIZERS,
     RECURSIVE,
+    Growth,
+    Indices,
+    Replayed,
     Runs,
     fused_name,
+    growth,
+    indices,
+    replay,
     simulate,
     simulate_known,
+    violation,
 )
-from heliograph_studies.h_infinity_fusion.growth import Growth, growth, violation
-from heliograph_studies.h_infinity_fusion.indices import Indices, Replayed, indices, replay
 from heliograph_studies.h_infinity_fusion.levels import (
     NodeDesigns,
     Readings,

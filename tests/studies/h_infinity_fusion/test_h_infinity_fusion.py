@@ -12,16 +12,7 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import h_infinity_fusion
-from heliograph_studies.h_infinity_fusion import (
-    compute,
-    discriminating,
-    example,
-    growth,
-    indices,
-    levels,
-    statements,
-    worst_disturbance,
-)
+from heliograph_studies.h_infinity_fusion import compute, discriminating, example, levels, statements, worst_disturbance
 from heliograph_studies.h_infinity_fusion.compute import Parts
 from heliograph_studies.h_infinity_fusion.setting import NODES, Setting, dynamics
 from tests.studies.h_infinity_fusion.verdicts import VERDICTS
@@ -168,13 +159,13 @@ def test_errors_saturation_and_indices(outcome):
     assert mean == pytest.approx(0.0354, abs=5.1e-5) and error < 1e-15  # nothing is random without measurements
     uplink = outcome.record.uplinks[example.fused_name(RECURSIVE, "dynamic")]
     assert uplink.saturated.mean() == pytest.approx(0.262, abs=0.01)  # 128 runs; the printed digits of the mean
-    replayed = indices.replay(outcome)
+    replayed = example.replay(outcome)
     np.testing.assert_array_equal(np.abs(outcome.estimates(RECURSIVE)) > replayed.amplitude,
                                   np.swapaxes(uplink.saturated, 1, 2))  # fmt: skip
-    answer = indices.indices(outcome, replayed)
+    answer = example.indices(outcome, replayed)
     np.testing.assert_allclose(answer.local[RECURSIVE], [-310.5, -273.5, -309.5, -351.3], atol=0.051)
     assert answer.fused[RECURSIVE] == pytest.approx(-2470.2, abs=0.051)
-    assert np.all(answer.local["zero_gain"] < 0) and np.all(answer.local[indices.ZERO] < 0)
+    assert np.all(answer.local["zero_gain"] < 0) and np.all(answer.local[example.ZERO] < 0)
 
 
 def test_losses_are_read_off_what_was_received(outcome):
@@ -190,7 +181,7 @@ def test_losses_are_read_off_what_was_received(outcome):
 
 
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
-    answer = growth.violation(SETTING, 0, nodes[0].horizon)
+    answer = example.violation(SETTING, 0, nodes[0].horizon)
     assert answer.level - 4 * answer.standard_error > nodes[0].horizon.level
 
 
@@ -217,7 +208,7 @@ def result(nodes, outcome):
     also = {f"horizon.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
     estimates = outcome.record.estimates | {"fused": shown | known | also}
     whole = replace(outcome, record=replace(outcome.record, estimates=estimates), filters=(*outcome.filters, "horizon"))
-    replayed = indices.replay(outcome)
+    replayed = example.replay(outcome)
     parts = Parts(
         SETTING,
         nodes,
@@ -227,8 +218,8 @@ def result(nodes, outcome):
         whole,
         example.Runs(SETTING, whole.record, ("ekf_known",)),
         replayed,
-        indices.indices(outcome, replayed),
-        growth.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
+        example.indices(outcome, replayed),
+        example.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
         levels.TrueGrowth(*np.full((3, 4, 2), 0.04), True),
         second,
     )

@@ -59,7 +59,8 @@ def joint_after(
     after = congruence(m, joint)
     after += wide @ noise @ wide.T
     after += measured if is_traced(measured) else measured.toarray()
-    return (after + after.T) / 2
+    result: Float[Array, "N N"] = (after + after.T) / 2
+    return result
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:

@@ -17,7 +17,7 @@ from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at
+from heliograph.model.over_time import at, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
@@ -356,7 +356,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         places=tuple(mine),
         nodes=graph.nodes,
         alpha=fusion.alpha,
-        quantizer=fusion.uplinks(graph.nodes),
+        quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],
     )

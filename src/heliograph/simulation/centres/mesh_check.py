@@ -3,6 +3,7 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_flow
@@ -78,7 +79,7 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
     by_data = fusion.quantizer is not None or any(item.trigger is not None for item in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):
-        return "nominal"
+        return weakest([known, "nominal"])
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
@@ -242,7 +243,7 @@ def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) ->
     plant, link, names = network.plant, fusion.link, graph.nodes
     if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:
         return
-    a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(np.zeros(len(plant.inputs))))
+    a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(jnp.zeros(len(plant.inputs))))
     items = [network.nodes[name] for name in names]
     rates = [1.0] * len(graph.edges) if link is None else [arrival_chance(c) for c in edge_links(link, graph).values()]
     arrival = np.array([p for p in rates if p is not None])

@@ -131,7 +131,7 @@ def errors_over_time(
     joint = np.tile(moments[1], (nodes, nodes))
     follows = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
-        blocks = blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders) if follows else None
+        blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if follows else None
         with jax.enable_x64(True):
             parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
         joint = moved(mesh, joint, parts, arrived)
@@ -156,7 +156,7 @@ def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> n
     for number, weights in enumerate(parts.exchanges):
         held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
         held[:, 0] = np.eye(held.shape[-1]) - held[:, 1:].sum(axis=1)
-        joint = congruence(spread(held, senders, present), joint)
+        joint = np.asarray(congruence(spread(held, senders, present), joint))
     m = spread(transitions(gains, parts.motion.matrix), senders, present)
     # Measurements of neighbours, or of all whose measurement a node has after all rounds.
     there = arrived[:, 0] & present
@@ -274,7 +274,7 @@ def freeze(
     for k, (joint, _, _) in enumerate(errors_over_time(mesh, flags, u)):
         # Blocks before a step are what its weights are made from.
         if k >= len(flags) - last:
-            blocks = blocks_of(joint.reshape(shape), mesh.senders)
+            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             total = blocks if total is None else total + blocks
     assert total is not None
     frozen = Fusion(item.filter, FrozenWeights(item.rule, total / last), neighbours=item.neighbours, link=item.link)

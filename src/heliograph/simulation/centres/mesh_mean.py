@@ -89,7 +89,8 @@ def mean_mesh_errors(
     for k, u_k in enumerate(u):
         with jax.enable_x64(True):
             step = to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k)))
-            blocks = blocks_of(joint.reshape(len(names), -1, len(names), len(network.states)), mesh.senders)
+            shape = (len(names), len(network.states)) * 2
+            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             gains = to_numpy(_gains(rows, covariance, blocks, patterns, step))
         joint, moments = _mean(mesh, joint, blocks, patterns, gains, step), step.plant
         n = len(step.motion.shift)
@@ -119,7 +120,8 @@ def _mean(
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
     # Gains of every pattern, M_i with the node itself first.
-    m, f, w = transitions(gains, step.motion.matrix), np.asarray(gains.innovation), used(gains.gain, patterns.present)
+    m, f = np.asarray(transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
+    w = np.asarray(used(gains.gain, patterns.present))
     # Different receivers: products of means.
     held = mean(w)
     everywhere = [spread(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
