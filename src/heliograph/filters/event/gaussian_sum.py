@@ -16,6 +16,7 @@ from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -144,9 +145,7 @@ class EventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        plant, sensor = at(self.plant, k), at(self.sensor, k)
-        x = plant.transition(mean, jnp.asarray(u)) + plant.noise_mean()
-        return jnp.asarray(sensor.measure(x) + sensor.noise.mean)
+        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:

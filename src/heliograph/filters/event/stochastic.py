@@ -18,6 +18,7 @@ from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive
 from heliograph.filters.modes.side_information import SideInformation, with_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -83,9 +84,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        plant, sensor = at(self.plant, k), at(self.sensor, k)
-        x = plant.transition(mean, jnp.asarray(u)) + plant.noise_mean()
-        return jnp.asarray(sensor.measure(x) + sensor.noise.mean)
+        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
