@@ -140,15 +140,8 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise no_c(equation.primitive.name, code_line(equation))
-    # Symmetry by induction: assume it for all arrays, drop those that a step does not keep symmetric, repeat.
     estimate, names = filter.estimate(state), names_of(state)
-    symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
-    while True:
-        graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
-        lost = {i for i in symmetric if not _is_symmetric(np.asarray(outputs[i]))}
-        if not lost:
-            break
-        symmetric -= lost
+    graph, inputs, outputs = _with_symmetry(program, leaves)
     # Inputs are (state, z, u, k), outputs (state, mean, covariance).
     *buffers, of_z, of_u, of_k = inputs
     *after, mean, covariance = map(scalars, outputs)
@@ -166,6 +159,17 @@ def step_program(filter: AbstractFilter) -> StepProgram:
         start_covariance=np.asarray(estimate.covariance),
         equations=equations,
     )
+
+
+def _with_symmetry(program: Any, leaves: list[Any]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:
+    """Lower a step by induction: assume all arrays symmetric, drop those that it does not keep symmetric, repeat."""
+    symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
+    while True:
+        graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
+        lost = {i for i in symmetric if not _is_symmetric(np.asarray(outputs[i]))}
+        if not lost:
+            return graph, inputs, outputs
+        symmetric -= lost
 
 
 def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:

@@ -184,7 +184,7 @@ def of_each(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: s
         return [value] * len(names)
     if set(value) != set(names):
         raise fail(name, f"one for each {whom} of {list(names)[:5]}", f"others: {sorted(set(value) ^ set(names))[:3]}")
-    return [value[item] for item in names]
+    return [value[key] for key in names]
 
 
 def instance(name: str, value: object, kind: type[T], what: str) -> T:

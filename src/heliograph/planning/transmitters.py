@@ -103,15 +103,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
             return channel, position
         # What wraps a link: inside it.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
-            name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
-            inside = position
-            if isinstance(channel, OfLine) and position.signal is not None:
-                line = _line(position.signal.second, channel.inputs // sent(channel))
-                inside = position._replace(signal=position.signal._replace(second=line))
-            inner, position = _visit(getattr(channel, name), visit, inside)
-            if inner is getattr(channel, name):
-                return channel, position
-            return eqx.tree_at(lambda c: getattr(c, name), channel, inner), position
+            return _visit_inside(channel, visit, position)
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
@@ -119,6 +111,20 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
     if all(changed is before for changed, before in zip(visited, channel.maps, strict=True)):
         return channel, position
     return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), position
+
+
+def _visit_inside(
+    channel: AbstractRandomAffine, visit: Visit, position: Position
+) -> tuple[AbstractRandomAffine, Position]:
+    """The changed channel around a link, which a line of past signals goes into where the channel is of such a line."""
+    name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
+    if isinstance(channel, OfLine) and position.signal is not None:
+        line = _line(position.signal.second, channel.inputs // sent(channel))
+        position = position._replace(signal=position.signal._replace(second=line))
+    inner, position = _visit(getattr(channel, name), visit, position)
+    if inner is getattr(channel, name):
+        return channel, position
+    return eqx.tree_at(lambda c: getattr(c, name), channel, inner), position
 
 
 def _visit_chain(

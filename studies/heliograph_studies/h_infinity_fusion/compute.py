@@ -131,9 +131,8 @@ def numbers(result: Parts) -> dict[str, Any]:
 
 
 def _node(node: NodeDesigns, level: float, result: Parts) -> dict[str, Any]:
-    """Levels of a node, and the certificate of the recursive design at the paper's level; states are (x, e)."""
-    smallest, design = {f"recursive_{name}": value for name, value in node.smallest.items()}, node.paper
-    steps = zip(design.weights, design.gains, design.weights[1:], design.multipliers, strict=False)
+    """Levels of a node, and the certificate of the recursive design at the paper's level."""
+    smallest = {f"recursive_{name}": value for name, value in node.smallest.items()}
     return {
         "gamma_paper": level,
         "steps_certified": node.certificate.steps_certified,
@@ -142,11 +141,18 @@ def _node(node: NodeDesigns, level: float, result: Parts) -> dict[str, Any]:
         "gamma_min_fixed_start": result.readings.fixed_start,
         "gamma_without_measurements": node.without_measurements,
         "failed_step_without_objective": node.failed["none"],
-        "certificate": [
-            {"P": p, "K": k, "L_next": np.linalg.inv(after), "lambda1": x, "lambda2": y, "gamma": design.level}
-            for p, k, after, (x, y) in steps
-        ],
+        "certificate": certificate(node),
     }
+
+
+def certificate(node: NodeDesigns) -> list[dict[str, Any]]:
+    """Everything that Theorem 1 needs at each step, for the design at the paper's level; states in the order (x, e)."""
+    design = node.paper
+    steps = zip(design.weights, design.gains, design.weights[1:], design.multipliers, strict=False)
+    return [
+        {"P": p, "K": k, "L_next": np.linalg.inv(after), "lambda1": x, "lambda2": y, "gamma": design.level}
+        for p, k, after, (x, y) in steps
+    ]
 
 
 def _errors(runs: Runs, name: str, quantizers: Sequence[str]) -> dict[str, float]:

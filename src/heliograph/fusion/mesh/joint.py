@@ -21,14 +21,14 @@ def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[Array, "node
     parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
     others = (gains.front[:, None] @ parts)[:, 1:]
     alone = gains.innovation @ matrix - others.sum(axis=1)
-    result: Float[Array, "node degree n n"] = library(gains).concatenate([alone[:, None], others], axis=1)
-    return result
+    moves: Float[Array, "node degree n n"] = library(gains).concatenate([alone[:, None], others], axis=1)
+    return moves
 
 
 def used(gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]) -> Float[Array, "node degree n n"]:
     """W_i where the neighbour's measurement arrived."""
-    result: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
-    return result
+    taken: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
+    return taken
 
 
 def spread(
@@ -47,8 +47,8 @@ def spread(
 def congruence(m: Any, joint: Float[Array, "N N"]) -> Float[Array, "N N"]:
     """M J M' of a symmetric J."""
     half = (m @ joint).T
-    result: Float[Array, "N N"] = m @ (half if is_traced(half) else np.ascontiguousarray(half))
-    return result
+    carried: Float[Array, "N N"] = m @ (half if is_traced(half) else np.ascontiguousarray(half))
+    return carried
 
 
 def joint_after(
@@ -59,11 +59,11 @@ def joint_after(
     after = congruence(m, joint)
     after += wide @ noise @ wide.T
     after += measured if is_traced(measured) else measured.toarray()
-    result: Float[Array, "N N"] = (after + after.T) / 2
-    return result
+    joined: Float[Array, "N N"] = (after + after.T) / 2
+    return joined
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:
     """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
-    result: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
-    return result
+    blocks: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
+    return blocks

@@ -51,10 +51,10 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
         raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
     # Nodes have the filter or no sensor, and names of their own for the result.
     for node in network.mesh_nodes(name):
-        item = network.nodes[node]
-        if isinstance(item, Node) and fusion.filter not in item.filters:
-            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(item.filters) or "none")
-        if name in item.filters:
+        here = network.nodes[node]
+        if isinstance(here, Node) and fusion.filter not in here.filters:
+            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(here.filters) or "none")
+        if name in here.filters:
             raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
     _check_rule(what, fusion, network)
     graph = graph_of(neighbours, network.mesh_nodes(name))
@@ -72,12 +72,12 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
     sender by what it measured, a quantizer by what it cannot send.
     """
-    parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
+    parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
              for node in network.mesh_nodes(name)
-             if isinstance(item := network.nodes[node], Node)}  # fmt: skip
+             if isinstance(n := network.nodes[node], Node)}  # fmt: skip
     known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
-    senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
-    by_data = fusion.quantizer is not None or any(item.trigger is not None for item in senders)
+    senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
+    by_data = fusion.quantizer is not None or any(n.trigger is not None for n in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):
         return weakest([known, "nominal"])
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
@@ -118,8 +118,8 @@ def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph)
         raise fail(what, expected, "events" if fusion.rounds == 1 else f"{fusion.rounds} rounds")
     if fusion.quantizer is not None:
         fusion.check(graph.nodes, len(network.states))
-        for item in of_each("quantizers", fusion.quantizer, graph.nodes):
-            instance("quantizer between neighbours", item, UniformQuantizer, "one with a bound on its error whatever "
+        for lossy in of_each("quantizers", fusion.quantizer, graph.nodes):
+            instance("quantizer between neighbours", lossy, UniformQuantizer, "one with a bound on its error whatever "
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
 
@@ -131,8 +131,8 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     nodes = network.mesh_nodes(name)
     sensors = [network.nodes[node] for node in nodes]
     observations = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
-    varying = [item for pair in observations for item in pair] + [network.plant]
-    if any(isinstance(item, OverTime) for item in varying):
+    varying = [model for pair in observations for model in pair] + [network.plant]
+    if any(isinstance(model, OverTime) for model in varying):
         return
     # Matrices that do not vary.
     a = np.asarray(first(network.plant).matrix)
@@ -140,9 +140,9 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     refuse_angles(what, network.plant, *(sensor for sensor, _ in observations))
     # Squares H'H of each node's mean gain, and their sums over those upstream.
     squares = np.zeros((len(nodes), n, n))
-    for i, item in enumerate(sensors):
-        if isinstance(item, Node):
-            h, noise = _model(item)
+    for i, sensor in enumerate(sensors):
+        if isinstance(sensor, Node):
+            h, noise = _model(sensor)
             squares[i] = _scaled(h).T @ _scaled(h)
             _check_regular(f"{what}: node {nodes[i]!r}", noise)
     # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
@@ -198,22 +198,22 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
                            f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip
 
 
-def _sees(item: object, vector: np.ndarray) -> bool:
+def _sees(node: object, vector: np.ndarray) -> bool:
     """Test whether a node's own measurement shows a mode."""
-    if not isinstance(item, Node):
+    if not isinstance(node, Node):
         return False
-    return bool(np.any(np.abs(_scaled(_model(item)[0]) @ vector) > RANK))
+    return bool(np.any(np.abs(_scaled(_model(node)[0]) @ vector) > RANK))
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
     """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
     size = np.linalg.norm(a, 2) or 1.0
-    result = set()
+    hidden = set()
     for value in values:
         both = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
         if np.linalg.svd(both, compute_uv=False)[-1] < RANK:
-            result.add(bool(abs(value) >= 1 - MODE))
-    return result
+            hidden.add(bool(abs(value) >= 1 - MODE))
+    return hidden
 
 
 def _scaled(h: np.ndarray) -> np.ndarray:
@@ -222,9 +222,9 @@ def _scaled(h: np.ndarray) -> np.ndarray:
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
-def _model(item: Node) -> tuple[np.ndarray, np.ndarray]:
+def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
-    sensor, channel = first(item.sensor), second_order(arrived(first(item.channel)))
+    sensor, channel = first(node.sensor), second_order(arrived(first(node.channel)))
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
@@ -247,16 +247,16 @@ def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) ->
     items = [network.nodes[name] for name in names]
     rates = [1.0] * len(graph.edges) if link is None else [arrival_chance(c) for c in edge_links(link, graph).values()]
     arrival = np.array([p for p in rates if p is not None])
-    steady = all(_is_steady(item) for item in items if isinstance(item, Node))
+    steady = all(_is_steady(n) for n in items if isinstance(n, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
-    models = [_model(item) if isinstance(item, Node) else (np.zeros((1, len(a))), np.eye(1)) for item in items]
+    models = [_model(n) if isinstance(n, Node) else (np.zeros((1, len(a))), np.eye(1)) for n in items]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
 
 
-def _is_steady(item: Node) -> bool:
+def _is_steady(node: Node) -> bool:
     """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
-    if isinstance(item.sensor, OverTime) or isinstance(item.channel, OverTime):
+    if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
-    return not np.any(np.asarray(second_order(arrived(item.channel)).nominal.center)[:, :, :-1, :-1])
+    return not np.any(np.asarray(second_order(arrived(node.channel)).nominal.center)[:, :, :-1, :-1])

@@ -74,8 +74,8 @@ def _drawn(mesh: Mesh, key: jax.Array, steps: np.ndarray) -> jax.Array:
     def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         return mesh.edges.draw(state, key, k)
 
-    result: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
-    return result
+    drawn: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
+    return drawn
 
 
 def mesh_errors(
@@ -208,13 +208,13 @@ def best_possible(
         s = np.asarray(steps[k].data.information)
         information.append((known @ s.reshape(count, -1)).reshape(s.shape))
     # Riccati recursions of all nodes side by side, oldest measurement first.
-    result = np.array(start.covariance)
+    covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        predicted = a @ result @ a.T + model.motion.noise
-        result = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
-        result = (result + result.swapaxes(1, 2)) / 2
-    return result
+        predicted = a @ covariance @ a.T + model.motion.noise
+        covariance = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
+        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+    return covariance
 
 
 @quickly_compiled
@@ -234,9 +234,9 @@ def _reached(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
-    result = known @ step
-    result.data = np.minimum(result.data, 1)
-    return result
+    reached = known @ step
+    reached.data = np.minimum(reached.data, 1)
+    return reached
 
 
 def freeze(
@@ -262,9 +262,9 @@ def freeze(
         ValueError: no such fusion, one by another rule, more steps to average than there are.
     """
     mesh = mesh_named(network, fusion)
-    item = network.meshes[fusion]
-    if not item.rule.needs_joint:
-        raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(item.rule).__name__)
+    old = network.meshes[fusion]
+    if not old.rule.needs_joint:
+        raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(old.rule).__name__)
     flags = _flags(mesh, arrived)
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
@@ -277,7 +277,7 @@ def freeze(
             blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             total = blocks if total is None else total + blocks
     assert total is not None
-    frozen = Fusion(item.filter, FrozenWeights(item.rule, total / last), neighbours=item.neighbours, link=item.link)
+    frozen = Fusion(old.filter, FrozenWeights(old.rule, total / last), neighbours=old.neighbours, link=old.link)
     return Network(network.plant, network.nodes, {**network.fused, **network.meshes, fusion: frozen})
 
 
@@ -303,5 +303,5 @@ def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds de
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    result: np.ndarray = flags & mesh.edges.present[:, None]
-    return result
+    arrives: np.ndarray = flags & mesh.edges.present[:, None]
+    return arrives

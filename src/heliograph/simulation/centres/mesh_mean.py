@@ -64,23 +64,23 @@ def mean_mesh_errors(
             neighbours.
     """
     mesh = mesh_named(network, fusion)
-    item = network.meshes[fusion]
-    if not (item.rule.needs_joint or isinstance(item.rule, FrozenWeights)):
+    between = network.meshes[fusion]
+    if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
-        raise fail(f"mean errors of fusion {fusion!r}", expected, type(item.rule).__name__)
+        raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
     # Probability of each pattern of arrivals.
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
-    graph = graph_of(item.neighbours or {}, names)
-    links = {} if item.link is None else edge_links(item.link, graph)
+    graph = graph_of(between.neighbours or {}, names)
+    links = {} if between.link is None else edge_links(between.link, graph)
     chances = [_known(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
-    rule = item.rule.placed(graph)
+    rule = between.rule.placed(graph)
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
-    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
+    bucket = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     # Joint errors, step after step, averaged over the patterns.
@@ -125,16 +125,16 @@ def _mean(
     # Different receivers: products of means.
     held = mean(w)
     everywhere = [spread(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
-    result = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
+    after = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
     # One receiver: the mean over its patterns.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
     same = mean(flat @ inside @ flat.swapaxes(1, 2) + f @ q @ f.swapaxes(1, 2) + noise)
-    whole = result.reshape(count, n, count, n)
+    whole = after.reshape(count, n, count, n)
     items = np.arange(count)
     whole[items, :, items, :] = same
-    return np.asarray(result)
+    return np.asarray(after)
 
 
 def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:

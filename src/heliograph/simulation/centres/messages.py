@@ -78,8 +78,8 @@ def messages_of(
     if quantizer is not None:
         sent = eqx.filter_vmap(quantized, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
     means, covariances = (
-        jnp.concatenate([alone, now, part.reshape(-1, *alone.shape[1:])])
-        for alone, now, part in zip((mean, covariance), sent, way, strict=True)
+        jnp.concatenate([alone, now, late.reshape(-1, *alone.shape[1:])])
+        for alone, now, late in zip((mean, covariance), sent, way, strict=True)
     )
     rows = jnp.asarray(senders) + len(mean) * (1 + jnp.maximum(ages[:, -1], 0))
     # In place of an estimate that did not arrive a node's own, which is a number.

@@ -70,8 +70,8 @@ class NodeFilter(AbstractSizedFilter):
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return self._after(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
-        gain, offset = (jnp.concatenate([part[i, :size] for i, size in sensors])
-                        for part in (observation.gain, observation.offset))  # fmt: skip
+        gain, offset = (jnp.concatenate([stacked[i, :size] for i, size in sensors])
+                        for stacked in (observation.gain, observation.offset))  # fmt: skip
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
         total = gain @ covariance @ gain.T + noise
         innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
@@ -105,7 +105,7 @@ class NodeFilter(AbstractSizedFilter):
     def _after(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         sensed, all_nodes = self._parts(z, before)
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
-        now, _ = self.mesh.step(all_nodes, [part[None] for part in sensed], everything, jnp.asarray(u), jnp.asarray(k))
+        now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
         return NodeState(before, u, now)
 
 
@@ -116,17 +116,17 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events, a plant
             whose steps are of any length.
     """
-    item, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
+    between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     what = f"node {node!r} of fusion {fusion!r} by itself"
-    if item.rule.needs_joint:
+    if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
-                   type(item.rule).__name__)  # fmt: skip
-    if item.rounds > 1 or item.alpha is not None:
-        raise fail(what, "one exchange a step", "several rounds" if item.rounds > 1 else "events")
+                   type(between.rule).__name__)  # fmt: skip
+    if between.rounds > 1 or between.alpha is not None:
+        raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
     if "dt" in network.inputs:
         raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
     # The node's row of the graph: itself, then its neighbours.
-    graph, neighbours = graph_of(item.neighbours or {}, nodes), item.neighbours or {}
+    graph, neighbours = graph_of(between.neighbours or {}, nodes), between.neighbours or {}
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, graph.senders[i : i + 1, :count], np.ones((1, count), dtype=bool))
     names = (node, *neighbours[node])
@@ -135,7 +135,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     sizes = tuple(n.received for n in sensors)
     mesh = Mesh(
         plant=network.plant,
-        buckets=(Rows(item.rule.placed(row), np.zeros(1, dtype=int), count),),
+        buckets=(Rows(between.rule.placed(row), np.zeros(1, dtype=int), count),),
         ranks=np.zeros(1, dtype=int),
         edges=Edges((), np.zeros(0, dtype=int), row.present, 1),
         observation_model=Apart(tuple(models), np.arange(count), max(1, *sizes), (1,) * count),
@@ -150,7 +150,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     return NodeFilter(
         mesh=mesh,
         measured=sizes,
-        quantizer=next(iter(item.quantizers((node,))), None),
+        quantizer=next(iter(between.quantizers((node,))), None),
         receivers=tuple(name for name in nodes if node in neighbours[name]),
         claim=mesh.claim,
         states=network.states,
