@@ -9,9 +9,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import jaxtyping
 import pytest
 
 from tests.parts import RealParts, started
+from tests.shapes import where_shaped
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 IN_A_HURRY = (
@@ -19,6 +21,8 @@ IN_A_HURRY = (
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_disable_hlo_passes=hlo-verifier",
 )
+
+jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
 MOST, GROWTH = 1.4e9, 0.2e9  # bytes of a process before it lets go, and since it last did
 

@@ -24,6 +24,9 @@ PRIVATE = re.compile(
 )
 ARRAY = re.compile(r"\b(np\.ndarray|jax\.Array|ArrayLike|Array)\b")
 SHAPED = re.compile(r"(Float|Int|Bool|Shaped|Num|Real|Inexact)\[[^\[\]]*\]")
+DEFAULT = re.compile(
+    r"default|None|unless|if not|else|without|empty|by itself|omitted|otherwise"
+)  # said of a parameter
 LONG = 15  # lines of a function that needs a comment above its steps
 STEP = 14  # statements of a step
 SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
@@ -142,3 +145,24 @@ def test_arrays_of_public_functions_carry_shapes():
             elif ARRAY.search(text):
                 shaped += 1
     assert shaped >= SHARE * (shaped + len(bare)), "\n".join(bare)
+
+
+def entries(text: str) -> dict[str, str]:
+    """Descriptions under `Args:` by parameter."""
+    block = text.split("Args:\n", 1)[1].split("\n\n")[0] if "Args:\n" in text else ""
+    return {name: " ".join(words.split()) for name, words in re.findall(r"^ {4}(\w+): ((?:.|\n {5,})*)", block, re.M)}
+
+
+def test_parameters_of_public_functions_have_an_entry_each_that_says_the_default():
+    wrong = []
+    for path, node in public():
+        if isinstance(node, ast.ClassDef):
+            continue
+        described, args = entries(ast.get_docstring(node) or ""), node.args
+        positional = args.posonlyargs + args.args
+        optional = [*positional[len(positional) - len(args.defaults) :]]
+        optional += [a for a, default in zip(args.kwonlyargs, args.kw_defaults, strict=True) if default is not None]
+        lacking = [name for name in parameters(node) if name not in described]
+        unsaid = [a.arg for a in optional if not DEFAULT.search(described.get(a.arg, ""))]
+        wrong += [f"{path.relative_to(SOURCE)}: {node.name}: {', '.join(lacking + unsaid)}"] if lacking + unsaid else []
+    assert not wrong, "\n".join(wrong)

@@ -1,5 +1,6 @@
 """The words of identifiers: the field's standard terms, and no private ones."""
 
+import ast
 import re
 import tokenize
 from pathlib import Path
@@ -17,6 +18,10 @@ PRIVATE = {
 }  # as a part of an identifier too  # fmt: skip
 PARTS = {"own", "wanted", "asked", "kept", "found"}  # as a part of one
 VAGUE = PARTS | {"one", "each", "many"}  # as a whole identifier
+HIDING = {"item", "part", "result", "local", "place", "thing"}  # what a name holds has a word of the field
+# Parts of the plants, of which a process serves some, are called so; and the outcome beside what a paper prints.
+SHOWN = {"serving/brokers/mqtt.py", "serving/brokers/nats.py", "serving/brokers/transport.py", "serving/running.py",
+         "report/page.py"}  # fmt: skip
 LIBRARIES = {"ModuleNotFoundError", "FileNotFoundError", "NotFoundError"}  # names of others
 OTHERS = {"one", "retain"}  # attributes of another library's objects, used as theirs
 
@@ -53,3 +58,27 @@ def test_no_identifier_is_a_private_word(root):
         if name not in LIBRARIES and not (of_another and name in OTHERS) and is_private(name)
     }
     assert not wrong, "\n".join(sorted(wrong))
+
+
+def bound(tree: ast.AST) -> set[str]:
+    """Names that code binds: variables, parameters, functions, and what a pattern matches."""
+    names = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store()) | ast.arg(arg=name) | ast.FunctionDef(name=name):
+                names.add(name)
+            case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+                names.add(name)
+    return names
+
+
+def test_a_name_says_what_it_holds():
+    """Of the library: "filter", "moments", "row", where "item" and "result" would do for anything."""
+    wrong = {
+        f"{name}: {', '.join(sorted(hiding))}"
+        for path in ROOTS[0].rglob("*.py")
+        if (name := path.relative_to(ROOTS[0]).as_posix()) not in SHOWN
+        and (hiding := bound(ast.parse(path.read_text())) & HIDING)
+    }
+    assert not wrong, "\n".join(sorted(wrong))
+    assert bound(ast.parse("def f(x, *, item): result = [part for part in x]")) == {"f", "x", "item", "result", "part"}

@@ -43,7 +43,7 @@ from heliograph.report.page import (
     Table,
     Text,
 )
-from heliograph_studies.statement import Statement, Verdict
+from heliograph_studies.statement import Rule, Sampled, Statement, Verdict
 
 SAID: Mapping[Verdict, tuple[str, str]] = {
     "fails": ("fails", "fail"),
@@ -52,6 +52,7 @@ SAID: Mapping[Verdict, tuple[str, str]] = {
 }
 EMPTY = "**True but empty**: it would be so without any measurement, or what it presupposes is not met."
 PICTURE = re.compile(r"!\[(.*)\]\((\w+)\)", re.DOTALL)
+EVIDENCE = re.compile(r"([\w.]+) = (.*)")
 COLOURED = re.compile(r"(#[0-9a-f]{6})\s+(.*)", re.DOTALL)
 
 
@@ -87,7 +88,7 @@ def page(
 
 
 def filled(template: Path, numbers: Mapping[str, object]) -> str:
-    """The template's text with numbers put in; `fmt` writes one as Python's format does.
+    """The template's text with numbers put in; `fmt` writes one as Python's format does, `pm` one with its error.
 
     Raises:
         ValueError: a template that puts in what is not there.
@@ -95,11 +96,52 @@ def filled(template: Path, numbers: Mapping[str, object]) -> str:
     environment = Environment(
         loader=FileSystemLoader(template.parent), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["fmt"] = format
+    environment.filters |= {"fmt": format, "pm": with_error}
     try:
         return environment.get_template(template.name).render(numbers)
     except TemplateError as error:
         raise fail(f"page {template}", "a template of what was found", error) from error
+
+
+def with_error(pair: tuple[float, float], digits: str = "") -> str:
+    """A number and its standard error, both as Python's format writes them; every digit by default."""
+    return f"{pair[0]:{digits}} ± {pair[1]:{digits}}"
+
+
+def stated(study: str, numbers: Mapping[str, object]) -> dict[str, list[Statement]]:
+    """The statements in `statements.md` beside a study's file, by the headings of the first level.
+
+    A heading of the second level is what is stated. Under it stand `where | what is printed there`, what is found, and
+    a block `judged`: a line `name = number` for each piece of evidence, and the rule of the verdict.
+
+    Raises:
+        ValueError: a template that puts in what is not there, or a rule that asks for what is no evidence.
+    """
+    result: dict[str, list[Statement]] = {}
+    for part in re.split(r"^(?=##? )", filled(Path(study).with_name("statements.md"), numbers), flags=re.MULTILINE)[1:]:
+        level, _, rest = part.partition(" ")
+        text, _, body = rest.partition("\n")
+        if level == "#":
+            result[text] = group = []
+            continue
+        said, _, block = body.partition("```judged\n")
+        place, _, ours = said.strip().partition("\n")
+        source, _, paper = place.partition("|")
+        lines = [EVIDENCE.fullmatch(line) or line for line in block.strip().removesuffix("```").splitlines()]
+        evidence = {line[1]: number(line[2]) for line in lines if not isinstance(line, str)}
+        rule = Rule(" ".join(line.strip() for line in lines if isinstance(line, str)).strip())
+        if not rule.names <= {*evidence, "evidence"}:
+            raise fail(f"verdict on {text!r}", f"one that follows from {', '.join(evidence)}", repr(rule.text))
+        group.append(Statement(text, source.strip(), paper.strip(), " ".join(ours.split()), evidence, rule))
+    return result
+
+
+def number(text: str) -> float | Sampled:
+    """Evidence as it is written: a number, or one with its standard error."""
+    value, _, error = text.partition(" ± ")
+    if error:
+        return Sampled(float(value), float(error))
+    return int(text) if re.fullmatch(r"-?\d+", text) else float(text)
 
 
 def _add(
@@ -114,7 +156,8 @@ def _add(
     elif node.type == "table":
         blocks.append(_table(node))
     elif node.type == "fence" and node.info == "keys":
-        blocks.append(KeyFigures([_key_figure(line) for line in node.content.splitlines()]))
+        rows = [[part.strip() for part in line.split("|")] for line in node.content.splitlines()]
+        blocks.append(KeyFigures([KeyFigure(label, value, note, colour) for colour, label, value, note in rows]))
     elif node.type == "fence" and node.info == "statements":
         blocks += verdicts([statement for name in node.content.split() for statement in statements[name]])
     elif node.type == "fence":
@@ -130,11 +173,6 @@ def _add(
 def _text(node: SyntaxTreeNode) -> str:
     """What is written in a paragraph, heading or cell, in one line."""
     return " ".join(child.content for child in node.children).replace("\n", " ").strip()
-
-
-def _key_figure(line: str) -> KeyFigure:
-    colour, label, value, note = (part.strip() for part in line.split("|"))
-    return KeyFigure(label, value, note, colour)
 
 
 def _table(node: SyntaxTreeNode) -> Table:

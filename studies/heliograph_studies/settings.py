@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
 
 S = TypeVar("S")
 Plain = bool | int | float | str
@@ -23,6 +23,23 @@ class File(str):
 
 
 NO_FILE = File()
+
+
+def check_fields(setting: Any, **limits: int | tuple[float, ...]) -> None:
+    """Check a setting's `seed` and fields: whole numbers of at least so many, numbers from the first to the second.
+
+    Raises:
+        ValueError: one that is not.
+    """
+    for name, limit in limits.items():
+        for value in np.ravel(getattr(setting, name)).tolist():
+            if isinstance(limit, int):
+                check_count(name, value, limit)
+            else:
+                scalar(name, value, *limit)
+    if hasattr(setting, "seed"):
+        seed, seeds = check_seed("seed", setting.seed), getattr(setting, "seeds", 1)
+        check_seed(f"last of {seeds} seeds", seed + seeds - 1)
 
 
 def leaves(setting: object, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,6 +1,8 @@
 """One statement of a publication, the evidence on it, and the verdict that follows."""
 
+import ast
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,6 +27,11 @@ class Sampled(NamedTuple):
     def below(self, limit: float) -> bool:
         """Whether it is, sampling set aside."""
         return self.value - limit < -SIGNIFICANT * self.error
+
+
+def sampled(values: np.ndarray) -> Sampled:
+    """The mean of independent values, (run,), and its standard error."""
+    return Sampled(float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))))
 
 
 Evidence: TypeAlias = Mapping[str, "float | Sampled"]
@@ -77,3 +84,26 @@ def if_met(premise: bool | np.bool) -> Verdict:
 def vacuous(condition: bool | np.bool, anyway: bool | np.bool) -> Verdict:
     """ "fails", or "holds_vacuously" for a statement that says nothing since it would hold `anyway`, or "holds"."""
     return ("holds_vacuously" if anyway else "holds") if condition else "fails"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A verdict as an expression in Python of its evidence's names; `evidence` is all of it by name."""
+
+    text: str
+
+    @property
+    def names(self) -> set[str]:
+        """What it asks for."""
+        names = [node for node in ast.walk(ast.parse(self.text)) if isinstance(node, ast.Name)]
+        return {n.id for n in names} - {n.id for n in names if isinstance(n.ctx, ast.Store)} - set(VERDICTS)
+
+    def __call__(self, **evidence: float | Sampled) -> Verdict:
+        """The verdict."""
+        return eval(self.text, {**VERDICTS, "evidence": evidence, **evidence})  # type: ignore[no-any-return]
+
+
+VERDICTS: Mapping[str, object] = {
+    **{"holds": holds, "if_met": if_met, "vacuous": vacuous, "__builtins__": {}},
+    **{function.__name__: function for function in (abs, all, iter, max, min, zip)},
+}

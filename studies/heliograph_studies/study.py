@@ -32,22 +32,8 @@ WIDTH, KEYS = 80, 4  # of what is printed; key figures in it
 REPEATED = ("runs", "seed")  # what tells two runs of one study apart, not two studies
 
 
-def no_statements(_: object) -> Judged:
-    """Of an example, which nobody stated anything about."""
-    return {}
-
-
 def no_progress(what: str, done: int = 0, total: int = 0) -> None:
     """Of work that has not begun."""
-
-
-def no_files(_: object) -> Sequence[Path]:
-    """Settings alone say what is worked out."""
-    return ()
-
-
-def no_data(_: object, __: Path) -> None:
-    """All numbers are in the summary."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +43,8 @@ class Study(Generic[Setting, Outcome]):
     name: as the command line knows it. setting: a dataclass of numbers and of the library's objects, whose defaults are
     those of the publication. compute: from a setting to an outcome, each stage of the work through `Stages`. stages:
     how many names these have. figures: from an outcome, by name. page: a Markdown template (see `markdown`) beside the
-    function `words`, which gives what it puts in beside the outcome's own fields. publication: its title, else empty.
+    function `figures`. words: what the page puts in beside the outcome's fields and the constants (in capitals) of that
+    function's module. publication: its title, else empty.
     statements: what is stated, by name of each list. data: writes what else belongs into the folder. needs: packages of
     extras beside those of `report`. files: what is read that no setting names; what is missing is said before any work,
     and stages that were made of other contents are made again.
@@ -68,12 +55,12 @@ class Study(Generic[Setting, Outcome]):
     compute: Callable[[Setting, Stages], Outcome]
     stages: int
     figures: "Callable[[Outcome], Mapping[str, Figure]]"
-    words: Callable[[Outcome], Mapping[str, object]]
+    words: Callable[[Outcome], Mapping[str, object]] = lambda _: {}
     publication: str = ""
-    statements: Callable[[Outcome], Judged] = no_statements
-    data: Callable[[Outcome, Path], None] = no_data
+    statements: Callable[[Outcome], Judged] = lambda _: {}
+    data: Callable[[Outcome, Path], None] = lambda _, __: None
     needs: Sequence[str] = ()
-    files: Callable[[Setting], Sequence[Path]] = no_files
+    files: Callable[[Setting], Sequence[Path]] = lambda _: ()
     page: str = "page.md"
 
     def settings(self, values: Mapping[str, str]) -> Setting:
@@ -156,10 +143,8 @@ class Study(Generic[Setting, Outcome]):
 
     def make_page(self, setting: Setting, outcome: Outcome, statements: Judged, pictures: Mapping[str, bytes]) -> Page:
         """The page; `pictures` holds each figure as SVG. What differs from the publication stands first."""
-        fields = {name: getattr(outcome, name) for name in vars(outcome)}
-        numbers = {"setting": setting, "command": self.command(setting), **fields, **self.words(outcome)}
-        template = Path(inspect.getfile(self.words)).with_name(self.page)
-        page = markdown.page(template, numbers, pictures, statements)
+        template = Path(inspect.getfile(inspect.unwrap(self.figures))).with_name(self.page)
+        page = markdown.page(template, self.numbers(setting, outcome), pictures, statements)
         changed = self._changed(setting)
         if not changed:
             return page
@@ -168,6 +153,14 @@ class Study(Generic[Setting, Outcome]):
         rows = [[f"`{name}`", there, here] for name, (there, here) in changed.items()]
         table = Table(["setting", "there", "here"], rows, caption)
         return replace(page, sections=[Section(f"What differs from the {reference}", [table]), *page.sections])
+
+    def numbers(self, setting: Setting, outcome: Outcome) -> dict[str, object]:
+        """What the page may put in: names in capitals of the module that draws the figures, fields, and `words`."""
+        constants = {
+            name: value for name, value in vars(sys.modules[self.figures.__module__]).items() if name.isupper()
+        }
+        words = {"setting": setting, "command": self.command(setting), **self.words(outcome)}
+        return constants | {name: getattr(outcome, name) for name in vars(outcome)} | words
 
     def _changed(self, setting: Setting) -> dict[str, tuple[str, str]]:
         """Where a setting differs from the study's own, but for how many runs there are of what seed."""

@@ -113,7 +113,7 @@ def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(
 def test_a_profile_ends_where_the_likelihood_has_fallen(result, monkeypatch):
     """At the end of an interval, with all others at their best, l is lower by half the 95 % point of chi-square."""
     linear, profile = result.solutions[0], Solution._profile
-    place = linear.parameters.entries[1].place
+    place = linear.parameters.entries[1].coordinate
     monkeypatch.setattr(Solution, "_profile", lambda *of: profile(*of) if of[1] == place else (0.0, 0.0))
     row = result.rows("profile", "linear")[1]
     start = np.repeat(linear.x[None], 2, axis=0)

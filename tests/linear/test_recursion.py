@@ -6,7 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.linear.recursion import covariance_step
 from heliograph.numerics.linalg import pseudo_solve
-from heliograph_studies.quadratic_bias import printed
+from heliograph_studies.quadratic_bias import compute
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors
 
@@ -56,7 +56,7 @@ def test_claim_is_the_true_error(degree):
 
 @pytest.mark.parametrize("system", [EXAMPLE, two_sensors()], ids=["example", "two sensors"])
 def test_printed_filter_claims_and_has_what_the_oracle_says(system):
-    ours = printed.printed_quadratic(*model(system, 15), 15)
+    ours = compute.printed_quadratic(*model(system, 15), 15)
     expected, n = oracle.quadratic(system, 15, repaired=False), len(system.F) + system.C.shape[1]
     tolerance = 1e-11 * np.abs(expected.true).max()
     np.testing.assert_allclose(ours.schedule.gains.covariance, expected.claimed[1:, :n, :n], rtol=0, atol=tolerance)
@@ -67,7 +67,7 @@ def test_with_known_powers_the_printed_filter_is_the_best():
     item = oracle.Atoms(np.array([[1.3]]), np.array([1.0]))
     s = model(EXAMPLE.__class__(**{**EXAMPLE.__dict__, "l": item, "m": item}), 20)
     best = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, 20)).gains.covariance
-    result = printed.printed_quadratic(*s, 20)
+    result = compute.printed_quadratic(*s, 20)
     np.testing.assert_allclose(result.true_covariance, best, rtol=0, atol=1e-14)
     np.testing.assert_allclose(result.schedule.gains.covariance, best, rtol=0, atol=1e-14)
 

@@ -79,5 +79,5 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
     both = {"f": gains, "linear": hg.linear_filter(plant, sensor, hg.perfect())}
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
     others = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
-    smoothed = Sweeper(others, None).item
+    smoothed = Sweeper(others, None).sweep
     assert smoothed.fusions == () and [others.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.numerics.caching import cached
+from heliograph.numerics.caching import cached, shared
 from heliograph.random_affine.moments.monomials import symmetric_power
 
 CALLS: list[float] = []
@@ -87,3 +87,18 @@ def test_what_one_precision_traced_is_not_what_another_sees(order):
             result = np.asarray(programs[-1](gain))
         assert result.dtype == (np.float64 if double else np.float32)
         np.testing.assert_allclose(result, symmetric_power(gain, 3), rtol=1e-14 if double else 1e-5)
+
+
+class Compiled:
+    def __init__(self, source: Holder):
+        self.source = source
+
+
+def test_what_is_made_of_an_object_is_shared_while_somebody_holds_it():
+    make, source = shared(Compiled), Holder(1.0)
+    made = make(source)
+    assert make(source) is made and make(Holder(1.0)) is not made
+    gone = weakref.ref(made)
+    del made
+    gc.collect()
+    assert gone() is None and make(source).source is source

@@ -31,7 +31,7 @@ def traces(covariance):
     return np.trace(covariance, axis1=1, axis2=2)
 
 
-def test_the_steady_state_is_where_the_recursion_settles(local):
+def test_the_steady_state_is_where_the_recursion_stays(local):
     odd, even = local.trace("receiver")[1:]
     assert (even, odd) == pytest.approx((5.307279e-6, 5.355157e-6), rel=1e-6)  # digits given
     long = local_error_design(example(), 1500)  # the plant forgets by 0.98 a step

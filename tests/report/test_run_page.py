@@ -10,8 +10,9 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.report.health import Link, examine
+from heliograph.report.innovations import rounded
 from heliograph.report.outputs import errors_of
-from heliograph.report.run_page import errors_table, rounded, run_figures, run_page, run_summary
+from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
 from tests.losing import Losing
 
 STEPS = 300

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import pytest
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
+from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.url import address
+from heliograph.serving.message import Message
 from heliograph.serving.running import ServiceSettings, of_node
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
@@ -39,22 +42,33 @@ def chain(rule: hg.fusion.AbstractFusion | None = None, **options: object) -> hg
     return hg.Network(PLANT, {name: parts[name] for name in "abc"}, {"mesh": item})
 
 
+LOSSY = hg.erasure(hg.perfect(), 0.7)
+QUANTIZER = hg.fusion.UniformQuantizer(41, 0.7)
+NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
+
+
 @cache
-def services() -> dict[str, Fleet]:
-    network = chain(link=hg.erasure(hg.perfect(), 0.7))
-    return {name: Fleet(Lanes(node_network(network, name)), Options()) for name in "abc"}
+def services(quantized: bool = False, step: float | None = None) -> dict[str, Fleet]:
+    network = chain(link=LOSSY, quantizer=QUANTIZER if quantized else None)
+    return {name: Fleet(Lanes(node_network(network, name)), Options(step=step)) for name in "abc"}
 
 
-def exchanged(lost: np.ndarray) -> dict[str, dict[int, dict[str, list]]]:
+def in_steps(node: str, k: int, values: list[float]) -> bytes | Message | str:
+    return json.dumps({"node": node, "sequence": k, "time": k, "values": values}).encode()
+
+
+Measured = Callable[[str, int, list[float]], bytes | Message | str]
+
+
+def exchanged(
+    lost: np.ndarray, fleets: dict[str, Fleet], measurement: Measured = in_steps
+) -> dict[str, dict[int, dict[str, list]]]:
     """Estimates of the nodes by step; `lost` (step, edge) of the edges "ab", "ba", "bc", "cb"."""
-    nodes = {name: Service(item, InMemoryStore()) for name, item in services().items()}
+    nodes = {name: Service(item, InMemoryStore()) for name, item in fleets.items()}
     results: dict[str, dict[int, dict[str, list]]] = {name: {} for name in nodes}
     z = measured()
     for k in range(STEPS):
-        waiting: list[tuple[str, bytes]] = [
-            (name, json.dumps({"node": name, "sequence": k, "time": k, "values": z[name][k].tolist()}).encode())
-            for name in "ac"
-        ]
+        waiting: list[tuple[str, bytes | Message | str]] = [(n, measurement(n, k, z[n][k].tolist())) for n in "ac"]
         while waiting:
             to, body = waiting.pop(0)
             for output in nodes[to].take([body]):
@@ -62,9 +76,14 @@ def exchanged(lost: np.ndarray) -> dict[str, dict[int, dict[str, list]]]:
                 if output.kind == "message" and not lost[k, ["ab", "ba", "bc", "cb"].index(to + output.to)]:
                     waiting.append((output.to, output.body))
                 elif output.kind == "provisional":
-                    results[to][content["time"]] = content["estimates"]["fused"]["mesh"]
+                    results[to][step_of(content["time"])] = content["estimates"]["fused"]["mesh"]
                 assert output.kind != "refused", content
     return results
+
+
+def step_of(time: float | str) -> int:
+    """Step of an output; of dates those of a minute from noon on."""
+    return int(time) if not isinstance(time, str) else round((datetime.fromisoformat(time) - NOON).total_seconds() / 60)
 
 
 @cache
@@ -73,23 +92,76 @@ def measured() -> dict[str, np.ndarray]:
     return {name: np.asarray(record.measurements[name]) for name in "abc"}
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.4])
-def test_services_that_exchange_messages_tell_what_one_run_tells(loss: float):
+def some_lost(loss: float) -> np.ndarray:
     lost = np.random.default_rng(1).random((STEPS, 4)) < loss
     lost[:, 0] &= ~lost[:, 3]  # a node without a sensor sends once anything of the step came
+    return lost
+
+
+def agree(result: dict[str, dict[int, dict[str, list]]], lost: np.ndarray, network: hg.Network) -> None:
+    """Compare with one run of all nodes in which the same got lost."""
     flags = np.where(lost, np.nan, 1.0)
     reports = {"a": flags[:, 1:2], "b": flags[:, [0, 3]], "c": flags[:, 2:3]}
-    network = chain(link=hg.erasure(hg.perfect(), 0.7))
     record = hg.run(network, measured(), reports={"mesh": reports})
-    result = exchanged(lost)
     for name in "abc":
         expected = record.estimates[name]["mesh"]
+        assert set(result[name]) == set(range(STEPS))
         for k in range(STEPS):
             item = result[name][k]
-            assert item["claim"] == "upper"
+            assert item["claim"] == expected.claim
             # The same operations but for the order of sums.
             np.testing.assert_allclose(item["mean"], expected.mean[k], atol=1e-12)
             np.testing.assert_allclose(item["covariance"], expected.covariance[k], atol=1e-12)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.4])
+def test_services_that_exchange_messages_tell_what_one_run_tells(loss: float):
+    lost = some_lost(loss)
+    agree(exchanged(lost, services()), lost, chain(link=LOSSY))
+
+
+@pytest.mark.slow
+def test_means_that_nodes_quantize_themselves_are_those_of_one_run_also_where_some_are_beyond():
+    lost = some_lost(0.3)
+    result = exchanged(lost, services(quantized=True))
+    agree(result, lost, chain(link=LOSSY, quantizer=QUANTIZER))
+    beyond = [np.abs(np.array(item["mean"])).max() > 0.7 for item in result["a"].values()]
+    assert 2 < sum(beyond) < STEPS - 2
+
+
+@pytest.mark.slow
+def test_times_may_be_dates_and_clocks_some_seconds_off():
+    lost, off = some_lost(0.4), {"a": 0.0, "c": 7.3}
+
+    def dated(node: str, k: int, values: list[float]) -> bytes:
+        date = (NOON + timedelta(minutes=k, seconds=off[node] + (-1) ** k)).isoformat()
+        return json.dumps({"node": node, "sequence": k, "time": date, "values": values}).encode()
+
+    agree(exchanged(lost, services(step=60.0), dated), lost, chain(link=LOSSY))
+
+
+@pytest.mark.slow
+def test_each_node_reads_its_sensor_at_topics_of_others_and_a_node_without_one_counts_the_same_steps():
+    sources = {
+        "garden/a": hg.files.json_field("t", node="a", time="at", scale=0.1, step=60.0),
+        "garden/c": [hg.files.json_field("t", node="c", time="at", step=60.0)],
+    }
+    settings = ServiceSettings(chain(link=LOSSY), Options(), sources=sources, broker=address("mqtt://hub/rooms", {}))
+    alone = {name: of_node(settings, name) for name in "abc"}
+    assert [sorted(item.sources or {}) for item in alone.values()] == [["garden/a"], [], ["garden/c"]]
+    assert {item.options.step for item in alone.values()} == {60.0}
+    fleets = {name: Fleet(Lanes(item.network), item.options) for name, item in alone.items()}
+    readers = {name: Translator(alone[name].sources, alone[name].network) for name in "ac"}
+
+    def from_topic(node: str, k: int, values: list[float]) -> Message | str:
+        scale = 10.0 if node == "a" else 1.0
+        content = {"t": scale * values[0], "at": (NOON + timedelta(minutes=k)).isoformat()}
+        (message,) = readers[node].read(f"garden/{node}", json.dumps(content).encode(), NOON)
+        assert not readers[node].read(f"garden/{'ac'.replace(node, '')}", b'{"t": 1.0}', NOON)
+        return message
+
+    lost = some_lost(0.4)
+    agree(exchanged(lost, fleets, from_topic), lost, chain(link=LOSSY))
 
 
 def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun():
@@ -118,6 +190,15 @@ def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun(
 def test_bad_input_what_no_node_can_do_by_itself_is_refused(rule, options, message):
     with pytest.raises(ValueError, match=message):
         node_network(chain(rule, **options), "a")
+
+
+def test_bad_input_steps_of_any_length_are_no_steps_of_all_nodes():
+    plant = hg.LinearPlant([[1.0]], lambda u: u[:1, None], [0.0], [[1.0]], input_matrix=[[0.0]], inputs=["dt"])
+    sensor = hg.LinearSensor([[1.0]], 0.3)
+    node = hg.Node(sensor, hg.perfect(), {"alone": hg.kalman_filter(plant, sensor)})
+    item = hg.Fusion("alone", hg.fusion.TraceIntersection(), neighbours={"b": ["a"]})
+    with pytest.raises(ValueError, match="a plant whose time counts steps, which all nodes share, got the input 'dt'"):
+        node_network(hg.Network(plant, {"a": node, "b": None}, {"mesh": item}), "b")
 
 
 def test_bad_input_no_node_no_broker():

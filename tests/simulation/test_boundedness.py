@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.simulation.description.doubts import doubts_before_data
 
 UNSTABLE = [[-1.25]]
 
@@ -249,3 +250,13 @@ def test_what_varies_or_filters_is_refused():
         judged(plant([[0.9]]), (sensor, hg.model.over_time([hg.perfect()])))
     with pytest.raises(ValueError, match="boundedness: expected a LinearPlant that does not vary, got one that varies"):
         judged(hg.model.over_time([plant([[0.9]])]), (sensor, hg.perfect()))
+
+
+def test_a_link_that_delivers_late_is_refused_and_doubted():
+    """It has more inputs than the sensor has outputs, which no product of matrices may find out."""
+    late = hg.model.delayed(hg.hop(1.0, 0.1), 1)
+    with pytest.raises(ValueError, match="boundedness: expected channels without delays, got one that is late"):
+        scalar(late)
+    sensor = hg.LinearSensor([[1.0]], 2.5)
+    doubts = doubts_before_data(hg.Network(plant(UNSTABLE), {"a": hg.Node(sensor, late, {})}))
+    assert any("boundedness: not judged" in str(doubt) for doubt in doubts)

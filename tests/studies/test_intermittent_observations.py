@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from heliograph_studies import intermittent_observations
-from heliograph_studies.intermittent_observations import setting
+from heliograph_studies.intermittent_observations import setting, statements
 from heliograph_studies.intermittent_observations.mean_error import from_runs, iterate, mean_error, over_patterns
-from heliograph_studies.intermittent_observations.statements import statements
 from tests.riccati import riccati
 from tests.studies.readme import said_of
 
@@ -72,7 +71,7 @@ def test_means_from_runs_need_no_losses_to_be_seen():
     arrived = np.ones((2, 5), dtype=bool)
     received = 1.25**2 * 2.0 + 1.0  # h, with weight 1 as if all arrived
     simulated = from_runs(setting.SCALAR, 0.0, 1.0, filtered, arrived)
-    np.testing.assert_allclose(simulated.mean, received)
+    np.testing.assert_allclose(simulated.value, received)
     assert simulated.error == 0
 
 
@@ -106,7 +105,7 @@ def test_summary_has_the_numbers_of_each_test(numbers):
 def test_filters_that_ran_have_the_mean_that_is_known(result):
     """400 runs of 50 steps: within 4 standard errors."""
     for link in [result.scalar, *result.bursts]:
-        assert abs(link.simulated.mean - link.mean_error) < 4 * link.simulated.error
+        assert abs(link.simulated.value - link.mean_error) < 4 * link.simulated.error
 
 
 EXPECTED = {  # what the statements say of the truth

@@ -9,13 +9,10 @@ from heliograph.cli import main
 from heliograph.live.timeline import Timeline
 from heliograph.report.figures import svg
 from heliograph_studies.demo.recording import read_recording
-from heliograph_studies.late_data import Setting, example, plaza
+from heliograph_studies.late_data import Setting, example, figures, plaza
 from heliograph_studies.late_data.compute import Outcome, Trace, through_moving, through_plaza
-from heliograph_studies.late_data.figures import figures
-from heliograph_studies.late_data.packets import Packets, statistics
+from heliograph_studies.late_data.packets import SLOT, Packets, read_trace, statistics, synthetic_packets
 from heliograph_studies.late_data.plaza import fates_by_node
-from heliograph_studies.late_data.synthetic import synthetic_packets
-from heliograph_studies.late_data.trace import SLOT, read_trace
 from heliograph_studies.settings import differences
 from heliograph_studies.stages import Stages
 from heliograph_studies.study import no_progress

@@ -7,8 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import learning
-from heliograph_studies.learning import compute, figures
-from heliograph_studies.learning.setting import LAWS, METHODS, ROWS, Setting, learned, true_values, world
+from heliograph_studies.learning import LAWS, METHODS, ROWS, Setting, learned, true_values, world
 from heliograph_studies.outcome import summary
 from heliograph_studies.stages import Stages
 from heliograph_studies.study import no_progress
@@ -38,13 +37,13 @@ def test_a_batch_is_counted_once_and_stored(tmp_path, monkeypatch):
     """Few and short recordings: intervals by cosines cover most of the truth, and the second call computes nothing."""
     row, setting = ROWS[3]._replace(steps=200), Setting(batches=1, batch=32)
     assert row.name == "two_point" and row.form == "conditional"
-    first = compute.table(setting, stages(tmp_path), (row,))
+    first = learning.table(setting, stages(tmp_path), (row,))
 
     def again(*_):
         raise AssertionError("counted twice")
 
-    monkeypatch.setattr(compute, "counts", again)
-    assert compute.table(setting, stages(tmp_path), (row,)) == first
+    monkeypatch.setattr(learning, "counts", again)
+    assert learning.table(setting, stages(tmp_path), (row,)) == first
     result = first["two_point"]["conditional"]
     assert result.recordings == 32 and result.left_out < 0.5
     assert min(result.covered["cosines"].values()) > 75  # 95 less four standard errors of 32
@@ -59,11 +58,11 @@ def outcome():
     rng, recordings = np.random.default_rng(0), {}
     for row in ROWS:
         covered = {m: {n: float(rng.uniform(40, 99)) for n in names.get(row.name, usual)} for m in METHODS}
-        recordings.setdefault(row.name, {})[row.form] = compute.Coverage(640, 0.01, covered)
+        recordings.setdefault(row.name, {})[row.form] = learning.Coverage(640, 0.01, covered)
     coverage = {law: {form: c.covered for form, c in forms.items()} for law, forms in recordings.items()}
     drive = {"rmse": 0.3, "calibrated": 0.35, "second_half": 0.31, "second_half_calibrated": 0.34}
     relayed = {"seed": [0, 1], "rmse": [0.8, 0.9], "calibrated": [1.2, 1.4]}
-    return compute.Outcome(95.0, 64, coverage, recordings, {"direct": drive, "relayed": relayed})
+    return learning.Outcome(95.0, 64, coverage, recordings, {"direct": drive, "relayed": relayed})
 
 
 def test_the_summary(outcome):
@@ -76,22 +75,22 @@ def test_the_summary(outcome):
 
 
 def test_the_page_shows_every_row_and_the_recorded_drive(outcome, fits):
-    drawn = figures.figures(outcome)
+    drawn = learning.figures(outcome)
     assert len(drawn) == 1
     page = learning.example.make_page(Setting(), outcome, {}, {name: b"<svg/>" for name in drawn})
     html = page.html()
     fits(html)
     assert html.count("data:image/svg+xml") == 1
-    for words in (*figures.labelled(outcome), "On a recorded drive", "relayed, mean", "0.85", "1.30", "0.310"):
+    for words in (*learning.labelled(outcome), "On a recorded drive", "relayed, mean", "0.85", "1.30", "0.310"):
         assert words in html
 
 
 def test_pieces_of_the_drive_are_computed_once_and_stored(tmp_path, monkeypatch):
     pytest.importorskip("gtsam")
     calls = []
-    monkeypatch.setattr(compute, "of_direct", lambda recording: calls.append("direct") or {"rmse": 0.3})
-    monkeypatch.setattr(compute, "of_relayed", lambda _, seed: calls.append(seed) or {"seed": seed, "rmse": 0.8})
-    first = compute.plaza(Setting(), stages(tmp_path))
+    monkeypatch.setattr(learning, "of_direct", lambda recording: calls.append("direct") or {"rmse": 0.3})
+    monkeypatch.setattr(learning, "of_relayed", lambda _, seed: calls.append(seed) or {"seed": seed, "rmse": 0.8})
+    first = learning.plaza(Setting(), stages(tmp_path))
     assert first == {"direct": {"rmse": 0.3}, "relayed": {"seed": [0, 1, 2, 3, 4], "rmse": [0.8] * 5}}
-    assert compute.plaza(Setting(), stages(tmp_path)) == first
+    assert learning.plaza(Setting(), stages(tmp_path)) == first
     assert calls == ["direct", 0, 1, 2, 3, 4]

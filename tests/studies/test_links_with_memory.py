@@ -7,8 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import links_with_memory
-from heliograph_studies.links_with_memory import compute, figures
-from heliograph_studies.links_with_memory.setting import Setting, bursts
+from heliograph_studies.links_with_memory import Setting, bursts
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +16,7 @@ TOGETHER = {"shared", "separate_claimed", "separate_true"}
 
 
 def test_one_fading():
-    result = compute.fading_together(Setting())
+    result = links_with_memory.fading_together(Setting())
     assert result["shared"] == pytest.approx(0.227110, abs=6e-7)
     assert result["separate_claimed"] == pytest.approx(0.148447, abs=6e-7)
     assert result["separate_true"] == pytest.approx(0.238690, abs=6e-7)
@@ -25,7 +24,7 @@ def test_one_fading():
 
 @pytest.mark.parametrize(("lag", "ratio"), [(0.0, 1.0), (0.5, 1.40), (0.9, 2.35)])
 def test_how_wrong_no_memory_is(lag, ratio):
-    assert compute.too_sure(Setting(), lag) == pytest.approx(ratio, abs=0.006)
+    assert links_with_memory.too_sure(Setting(), lag) == pytest.approx(ratio, abs=0.006)
     levels = hg.random_affine.joint_modes(bursts(Setting(), lag))
     np.testing.assert_allclose(levels.initial, hg.random_affine.joint_modes(bursts(Setting())).initial, atol=1e-12)
 
@@ -34,18 +33,18 @@ def test_how_wrong_no_memory_is(lag, ratio):
 def outcome():
     """As it would be computed, with other numbers."""
     over_time = np.linspace(0.3, 0.1, 12)
-    score = compute.Score("nominal", 0.1, 0.2, 0.01, over_time, over_time)
-    known = compute.Known("exact", 0.1, 0.1, 0.01, over_time, over_time, 0.1)
+    score = links_with_memory.Score("nominal", 0.1, 0.2, 0.01, over_time, over_time)
+    known = links_with_memory.Known("exact", 0.1, 0.1, 0.01, over_time, over_time, 0.1)
     scores = dict.fromkeys(sorted(FILTERS), score) | {"exact": known}
     informed, together = {"losses": known, "classes": known}, dict.fromkeys(TOGETHER, 0.2)
     curve = {"lambda": [0.0, 0.5, 0.9], "ratio": [1.0, 1.5, 1.9]}
     memory = {"correlation": np.ones(3), "standard_error": np.ones(3), "p_value": 0.1, "predictable": 0.2}
-    return compute.Outcome({"e1": 9, "e2": 9}, {}, scores, scores, informed, together, curve, memory)
+    return links_with_memory.Outcome({"e1": 9, "e2": 9}, {}, scores, scores, informed, together, curve, memory)
 
 
 def test_the_summary(outcome):
     summary = json.loads(json.dumps(links_with_memory.example.summary(Setting(), outcome, {})))
-    assert set(summary["e1"]) == set(summary["e2"]) == FILTERS == set(figures.ROWS)
+    assert set(summary["e1"]) == set(summary["e2"]) == FILTERS == set(links_with_memory.ROWS)
     assert set(summary["e1"]["imm"]) == {"claim", "claimed", "true", "true_se"}
     assert summary["e1"]["exact"]["true_before_data"] == 0.1
     assert summary["runs"] == {"e1": 9, "e2": 9} and set(summary["one_fading"]) == TOGETHER
@@ -54,8 +53,8 @@ def test_the_summary(outcome):
 
 def test_the_page_shows_every_figure_and_filter(outcome, fits):
     pytest.importorskip("jinja2")
-    drawn = figures.figures(outcome)
+    drawn = links_with_memory.figures(outcome)
     html = links_with_memory.example.make_page(Setting(), outcome, {}, {name: b"<svg/>" for name in drawn}).html()
     fits(html)
     assert html.count("data:image/svg+xml") == len(drawn) == 3
-    assert all(label in html for label, _ in figures.ROWS.values())
+    assert all(label in html for label, _ in links_with_memory.ROWS.values())

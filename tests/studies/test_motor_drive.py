@@ -12,7 +12,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.numerics.extras import how_to_install
 from heliograph_studies import motor_drive
-from heliograph_studies.motor_drive import compute, drive, listeners, machine
+from heliograph_studies.motor_drive import compute, machine
 from heliograph_studies.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
 
 needs_simulator = pytest.mark.skipif(
@@ -105,12 +105,12 @@ def test_load_and_noise_of_the_model():
 
 
 def test_commands_reach_the_frequency_and_turn_with_it():
-    voltages = drive.commands() @ np.array([1, 1j])
+    voltages = machine.commands() @ np.array([1, 1j])
     turns = np.angle(voltages[1:] / voltages[:-1]) / (2 * np.pi * STEP)
-    after = round(drive.RAMP / STEP)
-    assert turns[after:] == pytest.approx(np.full(len(turns) - after, drive.FREQUENCY), rel=1e-9)
+    after = round(machine.RAMP / STEP)
+    assert turns[after:] == pytest.approx(np.full(len(turns) - after, machine.FREQUENCY), rel=1e-9)
     assert np.all(np.diff(turns[: after - 1]) > 0)
-    assert abs(voltages[-1]) == pytest.approx(drive.BOOST + drive.VOLTS_AT_50_HZ * drive.FREQUENCY / 50)
+    assert abs(voltages[-1]) == pytest.approx(machine.BOOST + machine.VOLTS_AT_50_HZ * machine.FREQUENCY / 50)
 
 
 def test_scores_of_made_up_errors():
@@ -134,13 +134,13 @@ def test_scores_of_made_up_errors():
 
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     truth = np.tile(RUNNING[:5] / RATED[:5], (4000, 1))
-    result = listeners.received(truth, 0)
+    result = compute.received(truth, 0)
     means = {"relay_1": 0.865 * 0.93, "relay_2": 0.79 * 0.93, "wired": 1.0}
     for node, gain in means.items():
         error = result[node].std(axis=0) / np.sqrt(4000)
         assert np.all(np.abs(result[node].mean(axis=0) - gain * RUNNING[:2]) < 4 * error), node
-    assert np.array_equal(result["relay_1"], listeners.received(truth, 0)["relay_1"])
-    assert not np.array_equal(result["relay_1"], listeners.received(truth, 1)["relay_1"])
+    assert np.array_equal(result["relay_1"], compute.received(truth, 0)["relay_1"])
+    assert not np.array_equal(result["relay_1"], compute.received(truth, 1)["relay_1"])
 
 
 def test_a_missing_simulator_is_said_before_the_work_starts(tmp_path, monkeypatch):
@@ -167,7 +167,7 @@ def test_refuses_settings_that_are_none(change, words):
 @pytest.mark.slow
 @needs_simulator
 def test_the_model_is_the_simulator_s_machine():
-    result = drive.simulate_drive(loaded=False)
+    result = machine.simulate_drive(loaded=False)
 
     def fine(x, u):
         def part(_, x):
@@ -184,10 +184,10 @@ def test_the_model_is_the_simulator_s_machine():
 @pytest.mark.slow
 @needs_simulator
 def test_the_simulator_s_speed_obeys_torque_and_load():
-    result = drive.simulate_drive().truth * RATED
+    result = machine.simulate_drive().truth * RATED
     rate = (machine.torque(result) - result[:, 5]) / machine.INERTIA
     error = np.diff(result[:, 4]) - STEP * (rate[1:] + rate[:-1]) / 2
-    error[round(drive.LOAD_STEP_AT / STEP) - 1] = 0.0  # the load jumps inside this step
+    error[round(machine.LOAD_STEP_AT / STEP) - 1] = 0.0  # the load jumps inside this step
     # Trapezoidal rule, (h lambda)^2 / 12 of h times the rate: 0.165^2 / 12 of 0.25 rad/s. At the start dry friction
     # settles within a step's time.
     assert np.max(np.abs(error[20:])) < 6e-4
@@ -197,7 +197,7 @@ def test_the_simulator_s_speed_obeys_torque_and_load():
 @pytest.mark.slow
 @needs_simulator
 def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
-    result = drive.simulate_drive()
+    result = machine.simulate_drive()
     case = compute.Case("load", result.voltages, [result.truth[:, :5]] * 2, machine.plant(Machine()))
     record = compute.run_case(case, range(2))
     assert record.failures() == []

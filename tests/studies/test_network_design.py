@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from heliograph_studies import network_design
-from heliograph_studies.network_design import compute, figures, published
-from heliograph_studies.network_design.published import Circuit, packets
+from heliograph_studies.network_design import compute
+from heliograph_studies.network_design.compute import Circuit, packets
 
 pytestmark = pytest.mark.slow
 
@@ -21,7 +21,7 @@ def results(tmp_path_factory, widths):
     powers = {"as_it_is": 5000.0, "centred": 1200.0, "centred_thousandth": 1.2}
     designs = {name: {"rmse": 1.0, "claimed": 1.0, "power": power} for name, power in powers.items()}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "POINTS", 6)
+        patch.setattr(network_design, "POINTS", 6)
         patch.setattr(compute, "demonstration", lambda *_: designs)
         patch.setattr(compute, "circuit", lambda: Circuit(25.0, 25.0))
         network_design.run(SETTING, out)
@@ -84,7 +84,7 @@ def test_a_relay_for_packets_saves_half_and_more(times, silent):
     """By plain iteration of the bound on the informed filter's mean error."""
     result = packets(times)
     assert result["silent"] == pytest.approx(silent, abs=0.5)
-    a, c = np.array(published.PLANT.matrix), np.array([[1.0, 1.0]])
+    a, c = np.array(compute.PLANT.matrix), np.array([[1.0, 1.0]])
     traces = []
     for q in (1.0, result["arrival"]):
         p = np.eye(2)

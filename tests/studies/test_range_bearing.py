@@ -6,8 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import range_bearing
-from heliograph_studies.range_bearing import compute
-from heliograph_studies.range_bearing.setting import close_by, passing
+from heliograph_studies.range_bearing import close_by, passing
 
 pytestmark = pytest.mark.slow
 
@@ -25,12 +24,12 @@ def few(network: hg.Network) -> hg.Network:
 
 
 def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path, monkeypatch, fits):
-    monkeypatch.setattr(compute, "passing", lambda *which, **how: few(passing(*which, **how)))
-    monkeypatch.setattr(compute, "close_by", lambda setting: few(close_by(setting)))
+    monkeypatch.setattr(range_bearing, "passing", lambda *which, **how: few(passing(*which, **how)))
+    monkeypatch.setattr(range_bearing, "close_by", lambda setting: few(close_by(setting)))
     range_bearing.run(range_bearing.Setting(runs=64, fading_runs=192), tmp_path)
     summary = json.loads((tmp_path / "range-bearing" / "summary.json").read_text())
     for name in ("quiet_cubature", "quiet_extended"):
-        elsewhere, across, line = (summary[case][name] for case in compute.CASES)
+        elsewhere, across, line = (summary[case][name] for case in range_bearing.CASES)
         for item in (elsewhere, across):
             assert abs(item["nees"] - 1) < 4 * item["nees_se"]
         assert across["largest"] < 6 and line["rmse"] > across["rmse"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph_studies.statement import Evidence, Statement, Verdict
+from heliograph_studies.statement import Evidence, Rule, Statement, Verdict
 
 Kinds = Mapping[Verdict, Evidence]
 
@@ -11,7 +11,8 @@ def check_verdicts(statements: Sequence[Statement], cases: Sequence[tuple[str, K
     """Each statement, in order, named by how it begins, gives the verdicts that evidence of both kinds asks for."""
     assert [s.text[: len(start)] for s, (start, _) in zip(statements, cases, strict=True)] == [c[0] for c in cases]
     for statement, (_, kinds) in zip(statements, cases, strict=True):
-        assert statement.evidence and not statement.judge.__closure__, statement.text  # it knows nothing else
+        assert statement.evidence and isinstance(statement.judge, Rule), statement.text
+        assert statement.judge.names <= {*statement.evidence, "evidence"}, statement.text  # it knows nothing else
         assert len(kinds) >= 2, statement.text
         for verdict, evidence in kinds.items():
             assert set(evidence) <= {*statement.evidence, "slack"}, statement.text

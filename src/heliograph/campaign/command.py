@@ -66,7 +66,7 @@ def _only(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tu
         return None
     if not 0 <= setting < len(campaign.settings):
         raise fail("--setting", f"a number from 0 to {len(campaign.settings) - 1}", setting)
-    chunks = [item.number for item in campaign.chunks(setting)]
+    chunks = [planned.number for planned in campaign.chunks(setting)]
     if chunk is not None and chunk not in chunks:
         raise fail("--chunk", f"a number from 0 to {chunks[-1]}", chunk)
     return [(setting, number) for number in (chunks if chunk is None else [chunk])]

@@ -60,7 +60,7 @@ def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Seq
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
         parts = [_sums(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
-            sums = [np.sum(part, axis=0) for part in zip(*parts, strict=True)]
+            sums = [np.sum(totals, axis=0) for totals in zip(*parts, strict=True)]
             results += _details_of(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
@@ -129,7 +129,7 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     Raises:
         ValueError: a folder without results, or without scores.
     """
-    folder, place = file_path("results folder", results), file_path("output folder", out)
+    folder, target = file_path("results folder", results), file_path("output folder", out)
     for name in (STORE, SUMMARY):
         if not (folder / name).exists():
             raise fail(f"results folder {folder}", f"{STORE} and {SUMMARY}, as `heliograph sweep` writes", f"no {name}")
@@ -137,8 +137,8 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
     text = explore_page(campaign, scores, partial(details, folder / STORE, campaign))
-    place.mkdir(parents=True, exist_ok=True)
-    path = place / EXPLORE
+    target.mkdir(parents=True, exist_ok=True)
+    path = target / EXPLORE
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -184,8 +184,8 @@ def _described(settings: int, campaign: Campaign, shown: Sequence[Score], scores
 
 def _first(scores: Sequence[Score]) -> list[Score]:
     shown: list[Score] = []
-    for _, part in groupby(scores, key=lambda score: score.setting):
-        rows = list(part)
+    for _, of_setting in groupby(scores, key=lambda score: score.setting):
+        rows = list(of_setting)
         if shown and len(shown) + len(rows) > ROWS:
             break
         shown += rows
@@ -203,11 +203,11 @@ def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> l
         return [_scored(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
-    result = look(settings[:1], steps)
-    result += look(settings[1 : ROWS // max(len(result), 1)], steps)
-    if len({item.state for item in result}) > 1:
-        scored += [item for item in result if not item.step]
-    return [_scored(campaign, scored), _over_time(campaign, [item for item in result if item.step])]
+    detailed = look(settings[:1], steps)
+    detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
+    if len({detail.state for detail in detailed}) > 1:
+        scored += [detail for detail in detailed if not detail.step]
+    return [_scored(campaign, scored), _over_time(campaign, [detail for detail in detailed if detail.step])]
 
 
 def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:

@@ -62,8 +62,8 @@ def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
-    left = [item for item in read_failures(out) if Job(item.setting, item.chunk) not in jobs]
-    entries = [asdict(item) for item in (*left, *failures)]
+    left = [failure for failure in read_failures(out) if Job(failure.setting, failure.chunk) not in jobs]
+    entries = [asdict(failure) for failure in (*left, *failures)]
     if not entries:
         path.unlink(missing_ok=True)
         partial.unlink(missing_ok=True)  # of a process that was killed

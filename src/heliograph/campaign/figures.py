@@ -76,16 +76,16 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
     figure, grid = _panels(len(shown), 2.5)
     colours = _colours(scores)
     # A curve for each filter, in order of the parameter, with +- 2 standard errors.
-    for axes, (title, part) in zip(grid, shown.items(), strict=False):
-        for name in dict.fromkeys(score.filter for score in part):
-            local = [score for score in part if score.filter == name]
-            local.sort(key=lambda score: float(values[score.setting]))
-            x = [values[score.setting] for score in local]
-            y, error = _columns(local, quantity)
+    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
+        for name in dict.fromkeys(score.filter for score in of_panel):
+            curve = [score for score in of_panel if score.filter == name]
+            curve.sort(key=lambda score: float(values[score.setting]))
+            x = [values[score.setting] for score in curve]
+            y, error = _columns(curve, quantity)
             label = in_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(in_figure(title), TITLE))
-    drawn = [score for part in shown.values() for score in part]
+    drawn = [score for of_panel in shown.values() for score in of_panel]
     _scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(in_figure(parameter), fontsize=10, color=INK)
     _finish(figure, grid, drawn, quantity, colours)
@@ -102,9 +102,9 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
     # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
-            local = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
-            y, error = _columns(local, quantity)
-            rows = [settings.index(score.setting) + shift for score in local]
+            curve = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
+            y, error = _columns(curve, quantity)
+            rows = [settings.index(score.setting) + shift for score in curve]
             axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
         axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)

@@ -30,6 +30,9 @@ def load_campaign(path: str | Path) -> Campaign:
     truth and measurements too), [inputs] name = a number or one for each step, timeout (seconds that a worker may take
     to build a setting or compute a chunk, 3600).
 
+    Args:
+        path: of the TOML file.
+
     Raises:
         ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
             network's function does not take.
@@ -183,8 +186,8 @@ def _listed(settings: object, name: str) -> list[Setting]:
 def _check_value(value: object, name: str) -> None:
     """Accept only values that JSON represents without loss."""
     if isinstance(value, dict | list):
-        for item in value.values() if isinstance(value, dict) else value:
-            _check_value(item, name)
+        for entry in value.values() if isinstance(value, dict) else value:
+            _check_value(entry, name)
     elif not isinstance(value, str | bool) and not _is_number(value):
         raise fail(name, "finite numbers, strings, booleans, lists or tables", repr(value))
 

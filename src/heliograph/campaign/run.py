@@ -75,9 +75,9 @@ def run_campaign(
         campaign: the campaign, from `load_campaign`.
         out: the results folder.
         workers: number of worker processes, by default one for each CPU; 0 computes in this process.
-        scheduler: address of a Dask scheduler, used instead of worker processes.
+        scheduler: address of a Dask scheduler, used instead of worker processes (default none).
         only: (setting, chunk) pairs to compute; by default all.
-        progress: called as progress(what, done, total) to report progress.
+        progress: called as progress(what, done, total) to report progress (default none).
 
     Raises:
         ValueError: a folder of something else or of another campaign, or one in use; a setting or chunk that does not
@@ -148,7 +148,7 @@ def _compute(
     total = already + len(missing)
     progress("simulating", already, total)
     failed |= _try(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
-    return dict(sorted(failed.items(), key=lambda item: (item[0].setting, item[0].chunk or 0)))
+    return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
 
 
 def _jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:

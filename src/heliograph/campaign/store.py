@@ -78,9 +78,9 @@ def join(parts: Mapping[int, Labels]) -> Labels:
             raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
     return Labels(
         states=labels.states,
-        nodes=_union([part.nodes for part in parts.values()]),
-        filters=_union([part.filters for part in parts.values()]),
-        received=max(part.received for part in parts.values()),
+        nodes=_union([of_setting.nodes for of_setting in parts.values()]),
+        filters=_union([of_setting.filters for of_setting in parts.values()]),
+        received=max(of_setting.received for of_setting in parts.values()),
     )
 
 
@@ -92,7 +92,7 @@ def check_within(labels: Labels, known: Labels, setting: int) -> None:
 
 
 def _union(names: Sequence[Sequence[str]]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name for part in names for name in part))
+    return tuple(dict.fromkeys(name for axis in names for name in axis))
 
 
 STORE = "results.zarr"
@@ -271,8 +271,8 @@ def remove_partial(path: Path) -> None:
 
 def stored_labels(path: Path) -> Labels:
     """Return the labels that the store was created with."""
-    result: Any = zarr.open_group(path, mode="r").attrs["labels"]
-    return labels_from(result)
+    stored: Any = zarr.open_group(path, mode="r").attrs["labels"]
+    return labels_from(stored)
 
 
 def stored_campaign(path: Path) -> Campaign:
@@ -302,13 +302,13 @@ def check_same(path: Path, campaign: Campaign) -> None:
 
 def _attributes(path: Path) -> Mapping[str, object]:
     try:
-        result = zarr.open_group(path, mode="r").attrs.asdict()
-        if not {"versions", "campaign", "network_source", "labels"} <= result.keys():
+        attributes = zarr.open_group(path, mode="r").attrs.asdict()
+        if not {"versions", "campaign", "network_source", "labels"} <= attributes.keys():
             raise ValueError("not all that it had")
     except (OSError, ValueError, KeyError, TypeError) as error:
         expected = "a store that can be read, or another folder"
         raise fail(f"{path / 'zarr.json'}", expected, f"a damaged one ({type(error).__name__})") from None
-    return result
+    return attributes
 
 
 def _differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:

@@ -140,22 +140,22 @@ def _arrays(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     example = next(iter(next(iter(e for e in estimates.values() if e)).values()))
     runs, horizon = example["nees_per_dimension"].shape
     tail = (len(labels.nodes), len(labels.filters))
-    result = {
+    arrays = {
         name: np.full((runs, horizon, *tail, *example[name].shape[2:]), np.nan)
         for name in ("error", "variance", "nees_per_dimension")
     }
     # Each filter goes to its place along the axes (node, filter).
     for node, filters in estimates.items():
         for name, values in filters.items():
-            place = labels.nodes.index(node), labels.filters.index(name)
-            for variable, array in result.items():
-                array[:, :, place[0], place[1]] = values[variable]
+            position = labels.nodes.index(node), labels.filters.index(name)
+            for variable, array in arrays.items():
+                array[:, :, position[0], position[1]] = values[variable]
     if "truth" in recorded:
-        result["truth"] = recorded["truth"]
-        result["measurement"] = np.full((runs, horizon, tail[0], labels.received), np.nan)
+        arrays["truth"] = recorded["truth"]
+        arrays["measurement"] = np.full((runs, horizon, tail[0], labels.received), np.nan)
         for node, z in recorded["measurements"].items():
-            result["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
-    return result
+            arrays["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
+    return arrays
 
 
 class Errors(AbstractReducer[dict[str, PyTree]]):
@@ -170,12 +170,12 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
     def of_step(self, step: PyTree) -> OfStep:
         """Collect the errors of one step."""
         recorded = {
-            part: jax.tree.map(
+            kind: jax.tree.map(
                 lambda estimate: _errors(step["truth"], estimate),
-                step[part],
+                step[kind],
                 is_leaf=lambda leaf: isinstance(leaf, Estimate),
             )
-            for part in ("estimates", "fused")
+            for kind in ("estimates", "fused")
         }
         if self.world:
             recorded |= {name: step[name] for name in ("truth", "measurements")}
@@ -184,11 +184,11 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Arrange the collected errors by node and filter."""
         results = {
-            part: by_name(network, collected, itemgetter(part), axis)
-            for part, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
+            field: by_name(network, collected, itemgetter(field), axis)
+            for field, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
         }
         estimates = {
-            node: {name: {part: values[node][name] for part, values in results.items()} for name in names}
+            node: {name: {field: values[node][name] for field, values in results.items()} for name in names}
             for node, names in network.claims().items()
         }
         if not self.world:

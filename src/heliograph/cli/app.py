@@ -22,7 +22,7 @@ def number(text: str) -> Parameter:
     return Parameter(help=text, converter=_whole)
 
 
-def place(text: str = "") -> Parameter:
+def path_option(text: str = "") -> Parameter:
     """Declare an option that is a file or folder."""
     return Parameter(help=text, converter=_path)
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from heliograph.cli.app import folder, place
+from heliograph.cli.app import folder, path_option
 
 if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
@@ -15,10 +15,10 @@ NAME = "design"
 
 
 def design(
-    task: Annotated[Path, place()],
+    task: Annotated[Path, path_option()],
     /,
     *,
-    out: Annotated[Path, place("Folder for the page, its figures and the designed network; made if missing.")],
+    out: Annotated[Path, path_option("Folder for the page, its figures and the designed network; made if missing.")],
 ) -> None:
     """Choose the powers of a network for the least error, or the least power for a target error, and report.
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import place
+from heliograph.cli.app import path_option
 
 if TYPE_CHECKING:
     from heliograph.export.c_files import Exported
@@ -18,7 +18,7 @@ def export(
     /,
     *,
     filter: Annotated[str, Parameter(help="Name of the filter.")],
-    out: Annotated[Path, place("The source to write, such as step.c; step.h is written beside it.")],
+    out: Annotated[Path, path_option("The source to write, such as step.c; step.h is written beside it.")],
     node: Annotated[str | None, Parameter(help="Node that has it; needed where several do.")] = None,
     precision: Annotated[str, Parameter(help="double, or float: single precision.")] = "double",
 ) -> None:
@@ -38,16 +38,16 @@ def export(
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
 
-    # Refuse a bad place before the network is loaded.
+    # Refuse a bad path before the network is loaded.
     check_place(out)
     loaded = load_network(network)
     chosen = node_of(loaded, filter, node)
-    item = loaded.nodes[chosen].filters[filter]
-    names = loaded.nodes[chosen].received_names[: item.received]
+    subject = loaded.nodes[chosen].filters[filter]
+    names = loaded.nodes[chosen].received_names[: subject.received]
     # Write the files, then compile and time them.
-    written = export_named(item, out, precision, names)
-    measured = cost(written.header, written.source, item.received, len(item.inputs), PRECISIONS[precision])
-    claim = claim_of(item, PRECISIONS[precision])
+    written = export_named(subject, out, precision, names)
+    measured = cost(written.header, written.source, subject.received, len(subject.inputs), PRECISIONS[precision])
+    claim = claim_of(subject, PRECISIONS[precision])
     print(visible(f"{written.header}, {written.source}: {chosen}/{filter} ({claim}), {precision} precision"))
     print("\n".join(costs(written, measured)))
 
@@ -58,7 +58,7 @@ def node_of(network: "Network", filter_name: str, node: str | None) -> str:
 
     having = [name for name in network.names if filter_name in network.nodes[name].filters]
     if not having:
-        known = sorted({name for item in network.nodes.values() for name in item.filters})
+        known = sorted({name for of_node in network.nodes.values() for name in of_node.filters})
         raise fail("--filter", f"one of the network's filters {known}", repr(filter_name))
     if node is None and len(having) > 1:
         raise fail("--node", f"one of {having}, which all have a filter {filter_name!r}", "none")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, place
+from heliograph.cli.app import number, path_option
 
 if TYPE_CHECKING:
     from heliograph.learning import Share
@@ -23,8 +23,8 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: rows or events; or a bag.")],
-    out: Annotated[Path, place("Folder for fitted.json, fitted_network.py, figures and a page; made if missing.")],
+    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; or a bag.")],
+    out: Annotated[Path, path_option("Folder of fitted.json, fitted_network.py, figures and page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
@@ -52,7 +52,7 @@ def fit(
     def work(advance: "Advance") -> "Learned":
         return learn(network, measurements, starts, seed, share, advance, truth)
 
-    learned = write_results(out, 6, work, lambda result: results(result, out, network))
+    learned = write_results(out, 6, work, lambda learning: results(learning, out, network))
     print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)

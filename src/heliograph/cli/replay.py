@@ -7,13 +7,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, place
+from heliograph.cli.app import number, path_option
 
 LONGEST = 1e6  # seconds that the system sleeps at once
 
 
 def replay(
-    recording: Annotated[Path, place("CSV or Parquet: rows of time, inputs and measurements; or events.")],
+    recording: Annotated[Path, path_option("CSV or Parquet: rows of time, inputs and measurements; or events.")],
     /,
     *,
     network: Annotated[str, Parameter(help="Whose recording it is: my_network.py, or my_network.py:name.")],
@@ -23,7 +23,7 @@ def replay(
     run: Annotated[float, Parameter(help="How many are lost in a row, on average; 1: each by itself.")] = 1.0,
     delay: Annotated[float, Parameter(help="Mean time on the way, of an exponential law: messages overtake.")] = 0.0,
     duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
-    trace: Annotated[Path | None, place("CSV of a recorded link, one delay a message, nan if lost.")] = None,
+    trace: Annotated[Path | None, path_option("CSV of a recorded link, one delay a message, nan if lost.")] = None,
     seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
 ) -> None:
     """Send a recording as messages, JSON lines on stdout for `heliograph serve`, at the pace of the recording."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import place
+from heliograph.cli.app import path_option
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -49,9 +49,11 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: rows or events; or a bag.")],
-    out: Annotated[Path | None, place("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
-    report: Annotated[Path | None, place("Folder for figures and a page on estimates, innovations and links.")] = None,
+    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; or a bag.")],
+    out: Annotated[Path | None, path_option("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
+    report: Annotated[
+        Path | None, path_option("Folder of figures and a page on estimates, innovations, links.")
+    ] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
     lag: Annotated[float | None, Parameter(help="Of events: also estimates given what came so much later.")] = None,
@@ -179,10 +181,10 @@ def _errors(record: "Record") -> list[str]:
     from heliograph.report.outputs import errors_of
 
     lines = []
-    for item in errors_of(record):
-        rmse = ", ".join(f"of {state} {value:.4g}" for state, value in item.rmse.items())
-        size = "" if isnan(item.nees) else f"; NEES per state {item.nees:.3g}"
-        lines.append(f"{item.node}/{item.filter}: RMSE {rmse}{size}")
+    for errors in errors_of(record):
+        rmse = ", ".join(f"of {state} {value:.4g}" for state, value in errors.rmse.items())
+        size = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
+        lines.append(f"{errors.node}/{errors.filter}: RMSE {rmse}{size}")
     return lines
 
 
@@ -190,7 +192,7 @@ def _doubted(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
     from heliograph.report.outputs import weighed_outputs
 
-    return [str(item) for item in weighed_outputs(network, record)]
+    return [str(output) for output in weighed_outputs(network, record)]
 
 
 def _claim(estimate: "Estimate") -> str:

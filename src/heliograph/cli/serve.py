@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import place
+from heliograph.cli.app import path_option
 
 
 def serve(
@@ -22,7 +22,7 @@ def serve(
         ),
     ] = None,
     process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
-    from_snapshot: Annotated[Path | None, place("Store of which to begin from the plants.")] = None,
+    from_snapshot: Annotated[Path | None, path_option("Store of which to begin from the plants.")] = None,
     anew: Annotated[
         list[str] | None,
         Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),

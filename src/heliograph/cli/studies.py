@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import folder, number, place
+from heliograph.cli.app import folder, number, path_option
 
 GROUP = "heliograph.studies"
 Changes = Annotated[
@@ -34,7 +34,7 @@ class Study(Protocol):
 
 def demo(
     *,
-    out: Annotated[Path, place("Folder for the estimates, figures, report and summary; made if missing.")],
+    out: Annotated[Path, path_option("Folder for the estimates, figures, report and summary; made if missing.")],
     seed: Annotated[int | None, number("Seed of the simulated relays; 0 unless given.")] = None,
     recording: Annotated[str | None, Parameter(help="Which drive: plaza1, or plaza2 unless given.")] = None,
     changes: Changes | None = None,
@@ -47,10 +47,10 @@ def example(
     name: Annotated[str | None, Parameter(help="Which example; without it, the list of them.")] = None,
     /,
     *,
-    out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
+    out: Annotated[Path | None, path_option("Folder for the example's own, with report and summary.")] = None,
     seed: Annotated[int | None, number("Seed of what is simulated; 0 unless given.")] = None,
-    trace: Annotated[Path | None, place("Log of a radio network, for an example that takes one.")] = None,
-    recording: Annotated[Path | None, place("Folder of a recording, for an example that takes one.")] = None,
+    trace: Annotated[Path | None, path_option("Log of a radio network, for an example that takes one.")] = None,
+    recording: Annotated[Path | None, path_option("Folder of a recording, for an example that takes one.")] = None,
     changes: Changes | None = None,
 ) -> None:
     """Run an example and report, or list them."""
@@ -63,7 +63,7 @@ def reproduce(
     method: Annotated[str | None, Parameter(help="Which publication, or all; without it, the list of them.")] = None,
     /,
     *,
-    out: Annotated[Path | None, place("Folder for figures, report, record and summary.")] = None,
+    out: Annotated[Path | None, path_option("Folder for figures, report, record and summary.")] = None,
     runs: Annotated[int | None, number("Monte Carlo runs; each publication has its own default.")] = None,
     seed: Annotated[int | None, number("Seed of the simulations; 0 unless given.")] = None,
     changes: Changes | None = None,

@@ -6,14 +6,14 @@ from typing import Annotated
 import rich.console
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, place
+from heliograph.cli.app import number, path_option
 
 
 def sweep(
-    campaign: Annotated[Path, place()],
+    campaign: Annotated[Path, path_option()],
     /,
     *,
-    out: Annotated[Path, place("Folder for the results; what is already there is not computed again.")],
+    out: Annotated[Path, path_option("Folder for the results; what is already there is not computed again.")],
     workers: Annotated[int | None, number("Processes here; 0: this one; by default one a CPU.")] = None,
     scheduler: Annotated[str | None, Parameter(help="Address of a Dask scheduler to work on instead.")] = None,
     setting: Annotated[int | None, number("Run only this setting, here in one process.")] = None,
@@ -32,10 +32,10 @@ def sweep(
 
 
 def explore(
-    results: Annotated[Path, place("Folder that `heliograph sweep` wrote.")],
+    results: Annotated[Path, path_option("Folder that `heliograph sweep` wrote.")],
     /,
     *,
-    out: Annotated[Path, place("Folder for explore.html.")],
+    out: Annotated[Path, path_option("Folder for explore.html.")],
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
     from heliograph.campaign.explore import explore_results

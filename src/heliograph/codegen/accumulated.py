@@ -43,10 +43,10 @@ class Begun:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
             pointers = self._pointers(number, results)
             program.once.run(pointers.ctypes.data, 0, 0, 1, 1)
-        for n, (buffer, place) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
+        for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
-                held = self.memory[place : place + buffer.size * kind.itemsize]
+                held = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
 
     def zeros(self) -> list[np.ndarray]:
@@ -83,7 +83,7 @@ class Begun:
         return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
 
     def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
-        place = self.program.summed.number
-        inputs = [*self.arguments[:place], numbers, *self.arguments[place:]]
+        position = self.program.summed.number
+        inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
         every = [*inputs, *self.program.code.tables, *results, self.memory]
         return np.array(addresses(every), dtype=np.uint64)

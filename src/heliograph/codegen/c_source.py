@@ -122,21 +122,21 @@ class CSource:
     def statements(self, block: Block, indent: str = "    ") -> list[str]:
         """Return a block's statements, in order."""
         lines: list[str] = []
-        for item in block.items:
+        for statement in block.items:
             # Only what is needed; the end of a loop always is.
-            if item not in self.needed and not isinstance(item, Check):
+            if statement not in self.needed and not isinstance(statement, Check):
                 continue
-            if isinstance(item, Node):
-                lines += self._node(item, indent)
-            elif isinstance(item, Loop):
-                lines += self._loop(item, indent)
-            elif isinstance(item, Guard):
-                lines += self._guard(item, indent)
-            elif isinstance(item, Store):
-                entry = self._entry(item.buffer, item.offset, item.strides, item.indices)
-                lines.append(f"{indent}{entry} = {self.name(item.node)};")
+            if isinstance(statement, Node):
+                lines += self._node(statement, indent)
+            elif isinstance(statement, Loop):
+                lines += self._loop(statement, indent)
+            elif isinstance(statement, Guard):
+                lines += self._guard(statement, indent)
+            elif isinstance(statement, Store):
+                entry = self._entry(statement.buffer, statement.offset, statement.strides, statement.indices)
+                lines.append(f"{indent}{entry} = {self.name(statement.node)};")
             else:
-                condition = item.loop.condition
+                condition = statement.loop.condition
                 assert condition is not None  # only a loop that ends by its condition has a check
                 lines.append(f"{indent}if (!{self.name(condition)}) break;")
         return lines
@@ -198,10 +198,10 @@ class CSource:
         """Write a loop, with variables that carry numbers from turn to turn."""
         deeper, lines = f"{indent}    ", []
         carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed]
-        for place in carried:
-            name, start = self._new(), loop.initial[place]
+        for index in carried:
+            name, start = self._new(), loop.initial[index]
             lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")
-            self.names[loop.parameters[place]] = self.names[loop.results[place]] = name
+            self.names[loop.parameters[index]] = self.names[loop.results[index]] = name
         head = "for (;;) {"
         if loop.length is not None:
             counter = self._new()
@@ -211,8 +211,8 @@ class CSource:
         lines += [f"{indent}{head}", *self.statements(loop.body, deeper)]
         # What follows may be another parameter, which must not have changed yet.
         ends: list[str] = []
-        for place in carried:
-            node = loop.following[place]
+        for index in carried:
+            node = loop.following[index]
             ends.append(self.name(node))
             if node.op == "parameter":
                 ends[-1] = self._new()
@@ -224,9 +224,9 @@ class CSource:
         """Write a guarded block; its results are zero if the condition does not hold."""
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
         lines = []
-        for result, _ in results:
-            self.names[result] = self._new()
-            lines.append(f"{indent}{c_type(result.type, self.real)} {self.names[result]} = 0;")
+        for outcome, _ in results:
+            self.names[outcome] = self._new()
+            lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
         deeper = f"{indent}    "
         lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.statements(guard.body, deeper)]
         return [*lines, *(f"{deeper}{self.names[r]} = {self.name(v)};" for r, v in results), f"{indent}}}"]

@@ -33,9 +33,9 @@ def target() -> llvm.Target:
 @cache
 def features() -> tuple[str, str, bool]:
     """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
-    result = llvm.get_host_cpu_features()
+    flags = llvm.get_host_cpu_features()
     arm = "aarch64" in target().triple or "arm64" in target().triple
-    return llvm.get_host_cpu_name(), result.flatten(), bool(result.get("fma")) or arm
+    return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
 
 
 class Machine:
@@ -118,12 +118,12 @@ class Compiled:
         self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
-        for array, common, place, buffer in zip(
+        for array, common, offset, buffer in zip(
             outputs, self.code.common, self.code.places, self.code.outputs, strict=True
         ):
             if common:
                 size = buffer.size * array.itemsize
-                array[...] = shared[place : place + size].view(array.dtype).reshape(buffer.shape)
+                array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
 
 
 class Alone:

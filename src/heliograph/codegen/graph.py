@@ -27,15 +27,15 @@ Number = float | int | bool
 class Unsupported(Exception):  # noqa: N818
     """Error of a program that is not supported: the operation, and its place in the program."""
 
-    def __init__(self, operation: str, place: str = ""):
-        super().__init__(f"{operation}{f' at {place}' if place else ''}")
-        self.operation, self.place = operation, place
+    def __init__(self, operation: str, where: str = ""):
+        super().__init__(f"{operation}{f' at {where}' if where else ''}")
+        self.operation, self.where = operation, where
 
 
 class Node:
     """One scalar operation on some nodes.
 
-    `value` has what is known at compile time: a constant's number, a parameter's or result's (loop, place), a load's
+    `value` has what is known at compile time: a constant's number, a parameter's or result's (loop, index), a load's
     (buffer, offset, strides). `serial` counts nodes in the order in which they were made.
     """
 
@@ -98,10 +98,10 @@ class Buffer:
         self.inside: tuple[Buffer, int] | None = None
         self.parts: list[Buffer] = []
 
-    def take_in(self, part: "Buffer", start: int) -> None:
+    def take_in(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""
-        part.inside = self, start
-        self.parts.append(part)
+        inner.inside = self, start
+        self.parts.append(inner)
 
     @property
     def owner(self) -> "tuple[Buffer, int]":
@@ -195,9 +195,9 @@ class Graph:
         for block in self.current.inwards():
             if key in block.seen:
                 return block.seen[key]
-        place = self._place(max((a.block.depth for a in args), default=0))
-        made = place.seen[key] = self.fresh(op, type, args, place, value)
-        place.items.append(made)
+        target = self._outermost(max((a.block.depth for a in args), default=0))
+        made = target.seen[key] = self.fresh(op, type, args, target, value)
+        target.items.append(made)
         return made
 
     def constant(self, value: Number, type: Type) -> Node:
@@ -227,9 +227,9 @@ class Graph:
         for block in self.current.inwards():
             if key in block.seen:
                 return block.seen[key]
-        place = self._place(max((i.block.depth for i in indices), default=0), buffer.block.depth)
-        made = place.seen[key] = self.fresh("load", buffer.type, indices, place, value)
-        place.items.append(made)
+        target = self._outermost(max((i.block.depth for i in indices), default=0), buffer.block.depth)
+        made = target.seen[key] = self.fresh("load", buffer.type, indices, target, value)
+        target.items.append(made)
         return made
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
@@ -238,9 +238,9 @@ class Graph:
         buffer.stores.append(written)
         self.current.items.append(written)
 
-    def _place(self, *depths: int) -> Block:
+    def _outermost(self, *depths: int) -> Block:
         """Return the outermost block of at least this depth, within the innermost pinned one."""
-        place, depth = self.current, max(depths)
-        while place.depth > depth and not place.pinned and place.parent is not None:
-            place = place.parent
-        return place
+        block, depth = self.current, max(depths)
+        while block.depth > depth and not block.pinned and block.parent is not None:
+            block = block.parent
+        return block

@@ -71,24 +71,24 @@ class _Evaluation:
 
     def block(self, items: list[Any]) -> None:
         """Evaluate operations and statements in order."""
-        for item in items:
-            if item not in self.needed:  # a check of a loop among them
+        for statement in items:
+            if statement not in self.needed:  # a check of a loop among them
                 continue
-            if isinstance(item, Store):
-                place = self._place(item.buffer, item.offset, item.strides, item.indices)
-                owner = item.buffer.owner[0]
-                self.memory[owner] = self.memory[owner].at[place].set(self.value(item.node))
-            elif isinstance(item, Loop):
-                self._loop(item)
-            elif isinstance(item, Guard):
-                self._guard(item)
-            elif item.op not in ("counter", "parameter", "result", "guarded"):
-                self.values[item] = self._operation(item)
+            if isinstance(statement, Store):
+                entry = self._entry_at(statement.buffer, statement.offset, statement.strides, statement.indices)
+                owner = statement.buffer.owner[0]
+                self.memory[owner] = self.memory[owner].at[entry].set(self.value(statement.node))
+            elif isinstance(statement, Loop):
+                self._loop(statement)
+            elif isinstance(statement, Guard):
+                self._guard(statement)
+            elif statement.op not in ("counter", "parameter", "result", "guarded"):
+                self.values[statement] = self._operation(statement)
 
     def _operation(self, node: Node) -> jax.Array:
         if node.op == "load":
             buffer, offset, strides = node.value
-            return self.memory[buffer.owner[0]][self._place(buffer, offset, strides, node.args)]
+            return self.memory[buffer.owner[0]][self._entry_at(buffer, offset, strides, node.args)]
         arguments = [self.value(a) for a in node.args]
         if node.op == "convert":
             return arguments[0].astype(DTYPES[node.type])
@@ -97,10 +97,10 @@ class _Evaluation:
         if node.op == "threefry":
             arguments = [a.astype(np.uint64) for a in arguments]
         operation = OPERATIONS[node.op] if node.op in OPERATIONS else getattr(lax, node.op)
-        result: jax.Array = operation(*arguments)
-        return result
+        computed: jax.Array = operation(*arguments)
+        return computed
 
-    def _place(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
+    def _entry_at(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
         pairs = zip(strides, indices, strict=True)
         return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)
 

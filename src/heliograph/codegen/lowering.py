@@ -53,7 +53,7 @@ class Lowering:
                 raise Unsupported(name)
             return RULES[name](self, equation, [self.nodes(x) for x in inputs])
         except Unsupported as error:
-            raise (error if error.place else Unsupported(error.operation, place(equation))) from None
+            raise (error if error.where else Unsupported(error.operation, code_line(equation))) from None
 
     def nodes(self, value: Value) -> np.ndarray:
         """Return a value as a NumPy array of nodes."""
@@ -88,15 +88,15 @@ def _check_shapes(equation: JaxprEqn, results: Sequence[Value]) -> None:
     for variable, value in zip(equation.outvars, results, strict=True):
         aval: Any = variable.aval
         if value.shape != aval.shape:
-            raise RuntimeError(f"{equation.primitive.name} at {place(equation)}: {value.shape} for {aval.shape}")
+            raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {value.shape} for {aval.shape}")
 
 
 def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
     """Arrange nodes in row-major order as an array."""
     flat = list(nodes)
-    result = np.empty(len(flat), dtype=object)
-    result[:] = flat
-    return result.reshape(shape)
+    array = np.empty(len(flat), dtype=object)
+    array[:] = flat
+    return array.reshape(shape)
 
 
 def keys_of(words: np.ndarray) -> np.ndarray:
@@ -119,14 +119,14 @@ def type_of(value: Any) -> Type:
     return TYPES[name]
 
 
-def result_type(equation: JaxprEqn, place: int = 0) -> Type:
+def result_type(equation: JaxprEqn, index: int = 0) -> Type:
     """Return the type of an operation's result."""
-    return type_of(equation.outvars[place].aval)
+    return type_of(equation.outvars[index].aval)
 
 
-def result_shape(equation: JaxprEqn, place: int = 0) -> tuple[int, ...]:
+def result_shape(equation: JaxprEqn, index: int = 0) -> tuple[int, ...]:
     """Return the shape of an operation's result."""
-    aval: Any = equation.outvars[place].aval
+    aval: Any = equation.outvars[index].aval
     return tuple(aval.shape)
 
 
@@ -143,12 +143,12 @@ def known_integers(value: np.ndarray) -> np.ndarray | None:
     return np.array([int(x.value) for x in flat], dtype=np.int64).reshape(value.shape)
 
 
-def place(equation: JaxprEqn) -> str:
+def code_line(equation: JaxprEqn) -> str:
     """Return the line of a user's or the library's code that an operation comes from."""
     traceback = equation.source_info.traceback
     frames: list[Any] = [] if traceback is None else traceback.frames
     inside = ("/jax/", "/equinox/", "/heliograph/codegen/")
-    outside = [f for f in frames if not any(part in f.file_name for part in inside)]
+    outside = [f for f in frames if not any(folder in f.file_name for folder in inside)]
     return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""
 
 

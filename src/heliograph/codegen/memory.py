@@ -70,11 +70,11 @@ class InMemory:
 
     def _load(self, graph: Graph) -> np.ndarray:
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
-        result = np.empty(self.shape, dtype=object)
+        nodes = np.empty(self.shape, dtype=object)
         for index in product(*map(range, self.shape)):
             offset = self.offset + sum(s * i for s, i in zip(self.strides, index, strict=True))
-            result[index] = graph.load(self.buffer, offset, strides, indices)
-        return result
+            nodes[index] = graph.load(self.buffer, offset, strides, indices)
+        return nodes
 
     def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
         """Return the same numbers in another shape, None if no strides describe it."""
@@ -83,7 +83,7 @@ class InMemory:
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
         strides: list[int] = []
         # New axes are split off old ones, from the last on; old axes that lie contiguously are merged.
-        place, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on
+        axis, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on
         base = 1
         for n in reversed(shape):
             if n == 1:
@@ -91,22 +91,22 @@ class InMemory:
                 continue
             # The next old axis, with those that go on from it.
             if left == 1:
-                if place < 0:
+                if axis < 0:
                     return None
-                left, base = axes[place]
-                place -= 1
-                while left % n and place >= 0 and axes[place][1] == axes[place + 1][0] * axes[place + 1][1]:
-                    left *= axes[place][0]
-                    place -= 1
-            while left < n and place >= 0 and axes[place][1] == base * left:
-                left *= axes[place][0]
-                place -= 1
+                left, base = axes[axis]
+                axis -= 1
+                while left % n and axis >= 0 and axes[axis][1] == axes[axis + 1][0] * axes[axis + 1][1]:
+                    left *= axes[axis][0]
+                    axis -= 1
+            while left < n and axis >= 0 and axes[axis][1] == base * left:
+                left *= axes[axis][0]
+                axis -= 1
             # The new axis does not divide what is left.
             if left % n:
                 return None
             strides.append(base)
             left, base = left // n, base * n
-        return self.view(shape, strides[::-1]) if left == 1 and place < 0 else None
+        return self.view(shape, strides[::-1]) if left == 1 and axis < 0 else None
 
 
 def contiguous(shape: Sequence[int]) -> tuple[int, ...]:

@@ -64,45 +64,45 @@ def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
     return Program(lowering.graph, inputs, outputs, tree)
 
 
-def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda item: True) -> set[Any]:
+def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda node: True) -> set[Any]:
     """Nodes, loops, guards, buffers and stores that these numbers need; only `among` some."""
     results: set[Any] = set()
     waiting: list[Any] = list(roots)
     while waiting:
-        item = waiting.pop()
-        if item not in results and among(item):
-            results.add(item)
-            waiting += _needs(item)
+        node = waiting.pop()
+        if node not in results and among(node):
+            results.add(node)
+            waiting += _needs(node)
     return results
 
 
-def _needs(item: Any) -> list[Any]:
-    if isinstance(item, Buffer):
-        within = [] if item.inside is None else [item.inside[0]]
-        return [*item.stores, *item.parts, *within]
-    around = [] if item.block.owner is None else [item.block.owner]
-    return around + _arguments(item)
+def _needs(node: Any) -> list[Any]:
+    if isinstance(node, Buffer):
+        within = [] if node.inside is None else [node.inside[0]]
+        return [*node.stores, *node.parts, *within]
+    around = [] if node.block.owner is None else [node.block.owner]
+    return around + _arguments(node)
 
 
-def _arguments(item: Any) -> list[Any]:
-    if isinstance(item, Store):
-        return [item.node, *item.indices]
-    if isinstance(item, Guard):
-        return [item.condition]
-    if isinstance(item, Loop):
-        return [] if item.condition is None else [item.condition]
+def _arguments(node: Any) -> list[Any]:
+    if isinstance(node, Store):
+        return [node.node, *node.indices]
+    if isinstance(node, Guard):
+        return [node.condition]
+    if isinstance(node, Loop):
+        return [] if node.condition is None else [node.condition]
     # Nodes: a load needs its buffer, a result of a loop the loop and the carry.
-    if item.op == "load":
-        return [*item.args, item.value[0]]
-    if item.op in ("parameter", "result"):
-        loop, place = item.value
-        return [loop, loop.initial[place], loop.following[place]]
-    if item.op == "counter":
-        return [item.value]
-    if item.op == "guarded":
-        guard, place = item.value
-        return [guard, guard.values[place]]
-    return list(item.args)
+    if node.op == "load":
+        return [*node.args, node.value[0]]
+    if node.op in ("parameter", "result"):
+        loop, index = node.value
+        return [loop, loop.initial[index], loop.following[index]]
+    if node.op == "counter":
+        return [node.value]
+    if node.op == "guarded":
+        guard, index = node.value
+        return [guard, guard.values[index]]
+    return list(node.args)
 
 
 def fusable(node: Node, products: set[Node]) -> Node | None:
@@ -116,9 +116,9 @@ def fusable(node: Node, products: set[Node]) -> Node | None:
 def products_of(items: Iterable[Any]) -> set[Node]:
     """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
     users: dict[Node, list[Any]] = {}
-    for item in items:
-        for used in uses(item):
-            users.setdefault(used, []).append(item)
+    for statement in items:
+        for used in uses(statement):
+            users.setdefault(used, []).append(statement)
     results: set[Node] = set()
     taken: set[Node] = set()
     for node in sorted((n for n in users if n.op == "mul" and n.type == "f64"), key=lambda n: -n.serial):
@@ -131,16 +131,16 @@ def products_of(items: Iterable[Any]) -> set[Node]:
     return results
 
 
-def uses(item: Any) -> list[Node]:
+def uses(node: Any) -> list[Node]:
     """Return the nodes that an item of a program uses directly."""
-    if isinstance(item, Node):
-        return list(item.args)
-    if isinstance(item, Store):
-        return [item.node, *item.indices]
-    if isinstance(item, Guard):
-        return [item.condition, *item.values]
-    if isinstance(item, Loop):
-        return [*item.initial, *item.following, *([] if item.condition is None else [item.condition])]
+    if isinstance(node, Node):
+        return list(node.args)
+    if isinstance(node, Store):
+        return [node.node, *node.indices]
+    if isinstance(node, Guard):
+        return [node.condition, *node.values]
+    if isinstance(node, Loop):
+        return [*node.initial, *node.following, *([] if node.condition is None else [node.condition])]
     return []
 
 
@@ -151,49 +151,49 @@ def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any
     count = -1
     while count != len(results):
         count = len(results)
-        results.update(item for item in items if item not in results and _varies(item, results))
+        results.update(node for node in items if node not in results and _varies(node, results))
     return results
 
 
-def _order(item: Any) -> int:
-    return item.serial if isinstance(item, Node) else 0
+def _order(node: Any) -> int:
+    return node.serial if isinstance(node, Node) else 0
 
 
-def _varies(item: Any, result: set[Any]) -> bool:
-    if isinstance(item, Buffer):
-        owner = item.owner[0]
-        if owner is not item:
-            return owner in result
-        return any(store.node in result or _is_apart(store.block, result) for store in item.stores)
+def _varies(node: Any, results: set[Any]) -> bool:
+    if isinstance(node, Buffer):
+        owner = node.owner[0]
+        if owner is not node:
+            return owner in results
+        return any(store.node in results or _is_apart(store.block, results) for store in node.stores)
     # Statements: a loop differs by its condition, a store makes its buffer differ.
-    if isinstance(item, Loop):
-        return item.length is None and (item.condition in result or any(p in result for p in item.parameters))
-    if isinstance(item, Guard):
-        return item.condition in result
-    if isinstance(item, Store):
-        if item.node in result or _is_apart(item.block, result):
-            result.add(item.buffer.owner[0])
+    if isinstance(node, Loop):
+        return node.length is None and (node.condition in results or any(p in results for p in node.parameters))
+    if isinstance(node, Guard):
+        return node.condition in results
+    if isinstance(node, Store):
+        if node.node in results or _is_apart(node.block, results):
+            results.add(node.buffer.owner[0])
             return True
         return False
     # Nodes: by their block, by memory, by the carry, else by their arguments.
-    if item.op in ("constant", "counter"):
+    if node.op in ("constant", "counter"):
         return False
-    if _is_apart(item.block, result):
+    if _is_apart(node.block, results):
         return True
-    if item.op == "load":
-        return item.value[0].owner[0] in result or any(i in result for i in item.args)
-    if item.op in ("parameter", "result"):
-        loop, place = item.value
-        return loop in result or loop.initial[place] in result or loop.following[place] in result
-    if item.op == "guarded":
-        guard, place = item.value
-        return guard in result or guard.values[place] in result
-    return any(a in result for a in item.args)
+    if node.op == "load":
+        return node.value[0].owner[0] in results or any(i in results for i in node.args)
+    if node.op in ("parameter", "result"):
+        loop, index = node.value
+        return loop in results or loop.initial[index] in results or loop.following[index] in results
+    if node.op == "guarded":
+        guard, index = node.value
+        return guard in results or guard.values[index] in results
+    return any(a in results for a in node.args)
 
 
-def _is_apart(block: Block, result: set[Any]) -> bool:
+def _is_apart(block: Block, results: set[Any]) -> bool:
     """Return whether a block lies in a loop or guard that differs between runs."""
-    return any(b.owner in result for b in block.inwards() if b.owner is not None)
+    return any(b.owner in results for b in block.inwards() if b.owner is not None)
 
 
 class Summed(NamedTuple):
@@ -211,7 +211,7 @@ def row_length(width: int, batches: int) -> int:
 
 def folded(sums: np.ndarray, batches: int) -> np.ndarray:
     """Return sums (..., batch) from rows (..., `row_length`)."""
-    result = sums[..., :batches].copy()
+    totals = sums[..., :batches].copy()
     beyond = sums[..., batches:]
-    result[..., : beyond.shape[-1]] += beyond
-    return result
+    totals[..., : beyond.shape[-1]] += beyond
+    return totals

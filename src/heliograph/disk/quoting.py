@@ -35,4 +35,4 @@ def in_file(text: str) -> str:
 def from_file(text: str) -> str:
     """Undo `in_file`."""
     code = r"\\(?:[\\nrt]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})"
-    return re.sub(code, lambda result: result[0].encode().decode("unicode_escape"), text)
+    return re.sub(code, lambda match: match[0].encode().decode("unicode_escape"), text)

@@ -40,7 +40,7 @@ def only_here(folder: Path) -> Iterator[bool]:
     The lock file is removed with the lock, and so are folders that were made for it and stayed empty. A killed process
     leaves the file, which then locks nothing.
     """
-    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    made = [missing for missing in (folder, *folder.parents) if not missing.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / LOCK
     try:
@@ -64,9 +64,9 @@ def only_here(folder: Path) -> Iterator[bool]:
             path.unlink(missing_ok=True)
             os.close(handle)
     finally:
-        for place in made:
+        for missing in made:
             with suppress(OSError):  # something is in it
-                place.rmdir()
+                missing.rmdir()
 
 
 def _lock(handle: int) -> bool:
@@ -186,7 +186,7 @@ def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
 def check_output_folder(folder: str | Path) -> None:
     """Raise ValueError unless files can be written in the folder, or it can be made."""
     folder = Path(folder)
-    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     name = f"output folder {folder}"
     if not existing.is_dir():
         raise fail(name, "a folder", "a file" if existing == folder else f"a file {existing} on its path")

@@ -44,7 +44,8 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
         filter: the filter.
         path: path of the source, which ends in .c; the header is written next to it.
         precision: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as L
-            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains.
+            D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains
+            (default "double").
 
     Returns:
         The two files, the number of each operation in a step, and the bytes of the state.
@@ -61,11 +62,11 @@ def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double"
 
 def export_named(filter: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
     """Write as `export_c`, with names for the components of z; without names the sensor's, or z0, z1, ..."""
-    item: AbstractFilter = instance("export", filter, AbstractFilter, "a filter")
+    checked: AbstractFilter = instance("export", filter, AbstractFilter, "a filter")
     source = check_place(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), shown(precision))
-    text = text_of(item, source.stem, PRECISIONS[precision], received)
+    text = text_of(checked, source.stem, PRECISIONS[precision], received)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -86,13 +87,13 @@ def check_place(path: str | Path) -> Path:
     return source
 
 
-def text_of(item: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
+def text_of(filter: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
     """Return the text of both files of a filter."""
-    names = received_names(item) if received is None else received
-    kind = f"a {type(item).__name__} in {'double' if real == 'double' else 'single'} precision"
-    if real == "float" and not isinstance(item, ScheduledFilter):  # whose covariances are a table
-        item, kind = factored(item), f"{kind}, its covariance as L D L'"
-    return c_text(step_program(item), Form(prefix, real, names, kind))
+    names = received_names(filter) if received is None else received
+    kind = f"a {type(filter).__name__} in {'double' if real == 'double' else 'single'} precision"
+    if real == "float" and not isinstance(filter, ScheduledFilter):  # whose covariances are a table
+        filter, kind = factored(filter), f"{kind}, its covariance as L D L'"
+    return c_text(step_program(filter), Form(prefix, real, names, kind))
 
 
 def received_names(filter: AbstractFilter) -> Sequence[str]:

@@ -27,8 +27,8 @@ def cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> 
     compiler = shutil.which(COMPILER)
     if compiler is None:
         return Cost(None, None)
-    with tempfile.TemporaryDirectory() as place:
-        folder, name = Path(place), source.stem
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, name = Path(temporary), source.stem
         for path in (header, source):
             shutil.copy(path, folder)
         (folder / "main.c").write_text(_timer(name, received, inputs, real), encoding="utf-8")

@@ -12,7 +12,7 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, place, scalars, traced, type_of
+from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
 from heliograph.codegen.memory import LARGE, InMemory
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import InputError, fail
@@ -139,16 +139,9 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     equations = list(_equations(program.jaxpr))
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
-            raise no_c(equation.primitive.name, place(equation))
-    # Symmetry by induction: assume it for all arrays, drop those that a step does not keep symmetric, repeat.
+            raise no_c(equation.primitive.name, code_line(equation))
     estimate, names = filter.estimate(state), names_of(state)
-    symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
-    while True:
-        graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
-        lost = {i for i in symmetric if not _is_symmetric(np.asarray(outputs[i]))}
-        if not lost:
-            break
-        symmetric -= lost
+    graph, inputs, outputs = _with_symmetry(program, leaves)
     # Inputs are (state, z, u, k), outputs (state, mean, covariance).
     *buffers, of_z, of_u, of_k = inputs
     *after, mean, covariance = map(scalars, outputs)
@@ -156,7 +149,7 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     return StepProgram(
         filter=filter,
         graph=graph,
-        leaves=[Leaf(*part) for part in parts],
+        leaves=[Leaf(*fields) for fields in parts],
         z=of_z,
         u=of_u,
         k=of_k,
@@ -166,6 +159,17 @@ def step_program(filter: AbstractFilter) -> StepProgram:
         start_covariance=np.asarray(estimate.covariance),
         equations=equations,
     )
+
+
+def _with_symmetry(program: Any, leaves: list[Any]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:
+    """Lower a step by induction: assume all arrays symmetric, drop those that it does not keep symmetric, repeat."""
+    symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
+    while True:
+        graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
+        lost = {i for i in symmetric if not _is_symmetric(np.asarray(outputs[i]))}
+        if not lost:
+            return graph, inputs, outputs
+        symmetric -= lost
 
 
 def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:
@@ -188,7 +192,7 @@ def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGrap
         with jax.enable_x64(True):
             outputs = [lowering.nodes(x) for x in lowering.inline(program, values)]
     except Unsupported as error:
-        raise no_c(error.operation, error.place) from None
+        raise no_c(error.operation, error.where) from None
     return graph, inputs, outputs
 
 
@@ -200,7 +204,7 @@ def no_c(operation: str, where: str) -> InputError:
 def place_of(operation: str, equations: list[Any]) -> str:
     """Return the source line of an operation of the graph."""
     same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
-    return next((place(e) for e in same), "an unknown line")
+    return next((code_line(e) for e in same), "an unknown line")
 
 
 def names_of(state: PyTree) -> list[str]:

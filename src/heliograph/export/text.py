@@ -144,12 +144,12 @@ def _start(members: Sequence[Member], real: Real, counts: bool) -> list[str]:
 
 def _checks(program: StepProgram, real: Real) -> list[str]:
     """Return the statements that refuse invalid inputs before the computation."""
-    item = program.filter
-    lines = [] if item.received else ["    (void)z;"]
-    lines += [] if item.inputs else ["    (void)u;"]
-    lines += [f"    if (isinf(z[{i}])) return 1;" for i in range(item.received)]
-    lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(item.inputs))]
-    return [*lines, f"    if (state->step >= {item.horizon}) return 3;"] if item.horizon is not None else lines
+    filter = program.filter
+    lines = [] if filter.received else ["    (void)z;"]
+    lines += [] if filter.inputs else ["    (void)u;"]
+    lines += [f"    if (isinf(z[{i}])) return 1;" for i in range(filter.received)]
+    lines += [f"    if (!isfinite(u[{i}])) return 2;" for i in range(len(filter.inputs))]
+    return [*lines, f"    if (state->step >= {filter.horizon}) return 3;"] if filter.horizon is not None else lines
 
 
 def _finish(members: Sequence[Member], program: StepProgram, source: CSource, counts: bool) -> list[str]:
@@ -169,10 +169,10 @@ def claim_of(filter: AbstractFilter, real: Real) -> Claim:
 
 def _comment(program: StepProgram, form: Form) -> str:
     """Return the explanation for a reader of the header."""
-    item, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
+    filter, prefix, claim = program.filter, form.prefix, claim_of(program.filter, form.real)
     # States that are angles say so.
-    circular = first(item.plant).circular if hasattr(item, "plant") else ()
-    units = [" (radians, from -pi to pi)" if name in circular else "" for name in item.states]
+    circular = first(filter.plant).circular if hasattr(filter, "plant") else ()
+    units = [" (radians, from -pi to pi)" if name in circular else "" for name in filter.states]
     lines = [
         f"{prefix}.h: one step of {form.kind}.",
         f"Made by heliograph {heliograph.__version__}; do not edit.",
@@ -183,14 +183,14 @@ def _comment(program: StepProgram, form: Form) -> str:
         "is not finite, 3 the step is past the end of what varies over time, 4 the estimate would not be finite.",
         "",
         *_numbered("z", form.received, [""] * len(form.received)),
-        *_numbered("u", item.inputs, [""] * len(item.inputs)),
-        *_numbered("mean", item.states, units),
-        f"covariance[{len(item.states)} * i + j] is that of the errors of mean[i] and mean[j].",
+        *_numbered("u", filter.inputs, [""] * len(filter.inputs)),
+        *_numbered("mean", filter.states, units),
+        f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",
         "All numbers are in the units in which the plant and the sensor were described.",
         f"Claim: {claim}, {MEANING[claim]}.",
     ]
-    if item.horizon is not None:
-        lines.append(f"Steps: {item.horizon}, from 0 on.")
+    if filter.horizon is not None:
+        lines.append(f"Steps: {filter.horizon}, from 0 on.")
     return "\n".join(f" * {visible(line).replace('*/', '* /').replace('/*', '/ *')}".rstrip() for line in lines)
 
 

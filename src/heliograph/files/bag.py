@@ -92,22 +92,22 @@ def opened(path: Path) -> "Iterator[tuple[AnyReader, str]]":
     if not path.exists():
         raise fail(str(path), "a bag", "nothing of that name")
     with ExitStack() as stack:
-        place, cut = path, ""
+        readable, cut = path, ""
         if path.suffix.lower() == ".mcap" and is_cut(path):
-            place, end = stack.enter_context(whole_part(path))
+            readable, end = stack.enter_context(whole_part(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
             cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
-        yield stack.enter_context(_reader(path, place)), cut
+        yield stack.enter_context(_reader(path, readable)), cut
 
 
 @contextmanager
-def _reader(path: Path, place: Path) -> "Iterator[AnyReader]":
+def _reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     try:
         # Types of ROS itself, for bags of releases that did not write them into the bag.
-        reader = AnyReader([place], default_typestore=get_typestore(Stores.LATEST))
+        reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a bag that can be opened", _reason(error)) from None

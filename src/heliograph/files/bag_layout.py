@@ -59,55 +59,55 @@ class Layout:
     def fits(self, table: np.ndarray) -> np.ndarray:
         """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
         fits = np.ones(len(table), dtype=bool)
-        for place, length in self.lengths.items():
-            fits &= _column(table, place, "uint32") == length
+        for begin, length in self.lengths.items():
+            fits &= _column(table, begin, "uint32") == length
         return fits
 
     def columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return each wanted field of messages of this layout, (messages,)."""
-        return {path: _column(table, place, kind) for path, (place, kind) in self.fields.items()}
+        return {path: _column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
-    def _message(self, place: int, kind: str, prefix: str) -> int:
-        """Pass over a message from a place on; return where it ends, as all of these do."""
+    def _message(self, begin: int, kind: str, prefix: str) -> int:
+        """Pass over a message from byte `begin` on; return where it ends, as all of these do."""
         for name, (node, of) in self._definitions[kind][1]:
-            place = self._field(place, str(node.name), of, prefix + name)
-        return place
+            begin = self._field(begin, str(node.name), of, prefix + name)
+        return begin
 
-    def _field(self, place: int, node: str, of: Any, path: str) -> int:
+    def _field(self, begin: int, node: str, of: Any, path: str) -> int:
         # Parts, texts and single numbers.
         if node == "NAME":
-            return self._message(place, of, f"{path}.")
+            return self._message(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":
-            place = _aligned(place, 4)
-            return place + 4 + self._length(place)
+            begin = _aligned(begin, 4)
+            return begin + 4 + self._length(begin)
         if node == "BASE":
-            return self._numbers(place, of[0], 1, path, [path])
+            return self._numbers(begin, of[0], 1, path, [path])
         # Lists, of numbers or of anything else.
-        (part, inner), count = of
+        (inner_node, inner), count = of
         if node == "SEQUENCE":
-            place = _aligned(place, 4)
-            count, place = self._length(place), place + 4
-        if part.name == "BASE" and inner[0] in NUMBERS:
+            begin = _aligned(begin, 4)
+            count, begin = self._length(begin), begin + 4
+        if inner_node.name == "BASE" and inner[0] in NUMBERS:
             near = any(name.startswith(f"{path}.") for name in self._paths)
-            return self._numbers(place, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)])
+            return self._numbers(begin, inner[0], count, path, [f"{path}.{i}" for i in range(count if near else 0)])
         for i in range(count):
-            place = self._field(place, part.name, inner, f"{path}.{i}")
-        return place
+            begin = self._field(begin, inner_node.name, inner, f"{path}.{i}")
+        return begin
 
-    def _numbers(self, place: int, kind: str, count: int, path: str, names: list[str]) -> int:
+    def _numbers(self, begin: int, kind: str, count: int, path: str, names: list[str]) -> int:
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutError
-        place = _aligned(place, size) if count else place
+        begin = _aligned(begin, size) if count else begin
         for i, name in enumerate(names):
             if name in self._paths:
-                self.fields[name] = place + i * size, kind
-        return place + count * size
+                self.fields[name] = begin + i * size, kind
+        return begin + count * size
 
-    def _length(self, place: int) -> int:
-        length = int.from_bytes(self._data[place : place + 4], "little")
-        self.lengths[place] = length
-        if len(self.lengths) > MOST_LENGTHS or (place and place + 4 + length > len(self._data)):
+    def _length(self, begin: int) -> int:
+        length = int.from_bytes(self._data[begin : begin + 4], "little")
+        self.lengths[begin] = length
+        if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
             raise LayoutError
         return length
 
@@ -134,10 +134,10 @@ class Decoder:
         except LayoutError:
             return False
         for node, parts in readings.items():
-            rows = np.concatenate([part.rows for part in parts])
+            rows = np.concatenate([block.rows for block in parts])
             order = np.argsort(rows, kind="stable")
             logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
-            joined = (np.concatenate([getattr(part, name) for part in parts])[order] for name in Readings._fields[1:])
+            joined = (np.concatenate([getattr(block, name) for block in parts])[order] for name in Readings._fields[1:])
             table.add_many(node, logged, *joined)
         return True
 
@@ -164,14 +164,14 @@ class Decoder:
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield the rows of messages of one topic and size that have one layout, and the wanted fields of these."""
         known = self._layouts[connection.topic, table.shape[1]]
-        left, place = np.arange(len(table)), 0
+        left, index = np.arange(len(table)), 0
         while len(left):
-            if place == len(known):
+            if index == len(known):
                 paths = {path for source, _ in self._sources.of(connection.topic) for path in _paths(source)}
                 known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
-            fits = known[place].fits(table[left])
-            yield left[fits], known[place].columns(table[left[fits]])
-            left, place = left[~fits], place + 1
+            fits = known[index].fits(table[left])
+            yield left[fits], known[index].columns(table[left[fits]])
+            left, index = left[~fits], index + 1
 
 
 class Readings(NamedTuple):
@@ -190,7 +190,7 @@ def _paths(source: Source) -> list[str]:
     """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
     if source.plant is not None or source.time_unit == "step":
         raise LayoutError
-    stamp = [] if source.time is None else [f"{source.time}.{part}" for part in STAMP]
+    stamp = [] if source.time is None else [f"{source.time}.{field}" for field in STAMP]
     return [*source.paths, *stamp, *([] if source.sequence is None else [source.sequence])]
 
 
@@ -199,13 +199,13 @@ def _reading(
 ) -> Readings:
     none = np.full(len(rows), -1, dtype=np.int64)
     values = np.full((len(rows), outputs), np.nan)
-    for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+    for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         value = columns[path].astype(np.float64)
-        values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
+        values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
     time = none
     if source.time is not None:
-        seconds, rest = (columns[f"{source.time}.{part}"] for part in STAMP)
+        seconds, rest = (columns[f"{source.time}.{field}"] for field in STAMP)
         time = seconds.astype(np.int64) * 10**9 + rest
         if seconds.dtype.itemsize > 4 or np.any(time <= 0):
             raise LayoutError
@@ -215,11 +215,11 @@ def _reading(
     return Readings(rows, time, sequence.astype(np.int64), values)
 
 
-def _column(table: np.ndarray, place: int, kind: str) -> np.ndarray:
-    part = np.ascontiguousarray(table[:, place : place + NUMBERS[kind]])
-    return part.view(np.dtype(kind).newbyteorder("<"))[:, 0]
+def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
+    column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
+    return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
 
 
-def _aligned(place: int, size: int) -> int:
-    """Return the next place from this one on that a number of a size may have."""
-    return 4 + -(-(place - 4) // size) * size
+def _aligned(begin: int, size: int) -> int:
+    """Return the next byte from this one on that a number of a size may have."""
+    return 4 + -(-(begin - 4) // size) * size

@@ -110,8 +110,8 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     times = _nanoseconds(record.time, origin)
     # The writer makes a folder; the file in it is complete in itself.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        place = Path(folder) / "bag"
-        with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        bag = Path(folder) / "bag"
+        with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             topics = {
                 topic: (writer.add_connection(topic, kind, typestore=store), kind)
                 for node, filters in record.estimates.items()
@@ -121,7 +121,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
             for stamp, topic, message in _messages(record, times, pose, store.types):
                 connection, kind = topics[topic]
                 writer.write(connection, stamp, store.serialize_cdr(message, kind))
-        shutil.move(place / f"{place.name}.mcap", partial)
+        shutil.move(bag / f"{bag.name}.mcap", partial)
 
 
 def _types() -> Any:
@@ -144,7 +144,7 @@ def _word(name: str) -> str:
 
 
 def _topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
-    if any(place is not None for places in pose.places(states) for place in places):
+    if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
         yield f"{prefix}/{_word(state)}", NUMBER
@@ -156,7 +156,7 @@ def _messages(record: Record, times: list[int], pose: Pose, types: Any) -> Itera
     """Yield time, topic and message of each estimate, in order of time."""
     # Estimates as arrays, once for all rows.
     number, places = types[NUMBER], pose.places(record.states)
-    moves = any(place is not None for part in places for place in part)
+    moves = any(state is not None for axes in places for state in axes)
     parts = [
         (f"/{_word(node)}/{_word(name)}", np.asarray(e.mean), np.asarray(e.covariance), _claims(e), is_sound(e))
         for node, filters in record.estimates.items()
@@ -191,7 +191,7 @@ def _odometry(
     """Return an odometry message; `covariance` is None where none is claimed."""
     geometry = "geometry_msgs/msg/"
     vector, header = types[f"{geometry}Vector3"], types["std_msgs/msg/Header"]
-    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, place) for place in places)
+    (position, bound), (velocity, twist_bound) = (_part(mean, covariance, states) for states in places)
     rotation = types[f"{geometry}Quaternion"](*_quaternion(*position[3:]))
     there = types[f"{geometry}Pose"](types[f"{geometry}Point"](*position[:3]), rotation)
     moving = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
@@ -207,9 +207,9 @@ def _part(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
     """Return the six numbers of pose or twist, and their covariance, row by row."""
-    numbers = [0.0 if place is None else float(mean[place]) for place in places]
+    numbers = [0.0 if state is None else float(mean[state]) for state in places]
     bound = np.zeros((6, 6))
-    named = [(axis, place) for axis, place in enumerate(places) if place is not None]
+    named = [(axis, state) for axis, state in enumerate(places) if state is not None]
     if covariance is None:
         bound[0, 0] = UNKNOWN
     elif named:

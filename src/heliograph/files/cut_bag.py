@@ -43,10 +43,10 @@ def whole_part(path: Path) -> Iterator[tuple[Path, int]]:
     end = whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        with path.open("rb") as file, copy.open("wb") as part:
+        with path.open("rb") as file, copy.open("wb") as whole:
             left = end
             while left and (block := file.read(min(BLOCK, left))):
-                part.write(block)
+                whole.write(block)
                 left -= len(block)
-            part.write(ENDING)
+            whole.write(ENDING)
         yield copy, end

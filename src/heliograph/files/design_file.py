@@ -66,7 +66,7 @@ def read_design(path: Path) -> DesignFile:
     # Network and problem.
     file, name = _place(path, table.get("network"), "network")
     free = table.get("free")
-    if free is not None and (not isinstance(free, list) or not all(isinstance(item, str) for item in free)):
+    if free is not None and (not isinstance(free, list) or not all(isinstance(name, str) for name in free)):
         raise fail(f"{path.name}, free", "a list of names", repr(free))
     network = load_network(f"{file}:{name}" if name else str(file))
     problem = DesignProblem(
@@ -118,9 +118,9 @@ def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
     """Return the Python file and the name in it."""
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
-    place, colon, name = value.rpartition(":")
-    place, name = (place, name) if colon and name.isidentifier() else (value, "")
-    file = path.parent / place
+    file_name, colon, name = value.rpartition(":")
+    file_name, name = (file_name, name) if colon and name.isidentifier() else (value, "")
+    file = path.parent / file_name
     if not file.is_file():
         raise fail(f"{path.name}, {key}", "a Python file in its folder", repr(value))
     return file, name
@@ -146,7 +146,7 @@ def designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarr
     error = file.problem.criterion
     _, colon, name = file.reference.rpartition(":")
     # The original is loaded relative to the file, so that the folder can be moved.
-    place = f'str(Path(__file__).with_name("{source}"))' + (f' + ":{name}"' if colon else "")
+    reference = f'str(Path(__file__).with_name("{source}"))' + (f' + ":{name}"' if colon else "")
     return "\n".join([
         '"""A network with designed powers, and the best linear filters for them."""',
         "",
@@ -158,7 +158,7 @@ def designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarr
         *(f"    {transmitter!r}: {np.asarray(power).tolist()}," for transmitter, power in powers.items()),
         "}",
         "network = hg.planning.designed_network(",
-        f"    hg.files.load_network({place}),",
+        f"    hg.files.load_network({reference}),",
         "    POWERS,",
         f"    hg.planning.Error(horizon={error.horizon}, period={error.period}),",
         ")",

@@ -142,9 +142,9 @@ class EventTable:
         names = list(self.columns)
         parts = [self._arrays(name) for name in names]
         values = [columns.matrix() for columns in self.columns.values()]
-        node = np.repeat(np.arange(len(names)), [len(part[0]) for part in parts])
-        row = np.concatenate([np.arange(len(part[0])) for part in parts])
-        arrivals = np.concatenate([part[1] for part in parts])
+        node = np.repeat(np.arange(len(names)), [len(arrays[0]) for arrays in parts])
+        row = np.concatenate([np.arange(len(arrays[0])) for arrays in parts])
+        arrivals = np.concatenate([arrays[1] for arrays in parts])
         # Exact differences of whole nanoseconds before they are floats.
         for i in np.lexsort((row, arrivals)).tolist():
             n, k = int(node[i]), int(row[i])
@@ -200,8 +200,8 @@ class EventTable:
             row, times = key[0], np.arange(int(key[0, -1]) + 1)
         # Values of each node; what came first at a time stays, and later events of the time fill what it had not.
         tables = []
-        for place, name in enumerate(names):
-            events = key[1] == place
+        for node, name in enumerate(names):
+            events = key[1] == node
             table = np.full((len(times), self.columns[name].size), np.nan)
             values, rows = self.columns[name].matrix()[key[3, events]], row[events]
             for i in range(table.shape[1]):
@@ -218,9 +218,9 @@ class EventTable:
         Of events of the same time, node and count the first stays.
         """
         parts = []
-        for place, name in enumerate([INPUTS, *self.network.names]):
+        for node, name in enumerate([INPUTS, *self.network.names]):
             time, _, sequence = self._arrays(name)
-            parts.append(np.stack([time, np.full(len(time), place), sequence, np.arange(len(time))]))
+            parts.append(np.stack([time, np.full(len(time), node), sequence, np.arange(len(time))]))
         key = np.concatenate(parts, axis=1)
         key = key[:, np.lexsort(key[::-1])]
         first = np.ones(key.shape[1], dtype=bool)

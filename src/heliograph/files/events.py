@@ -124,19 +124,19 @@ def run_events(
         origin = None if table.steps else table.date
     continuous = TIME_STEP in network.inputs
     start = first if continuous else 0.0  # the initial law is that of the first moment
-    result = play(network, events, window, lag, start)
+    played = play(network, events, window, lag, start)
     # Summary: verdicts by node, what was forced, and the file of lagged estimates.
     lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in element.items() if count)
-             for node, element in result.counts.items() if any(element.values())]  # fmt: skip
-    if result.forced:
-        lines.append(f"{result.forced} rows became final before their time, for want of room")
+             for node, element in played.counts.items() if any(element.values())]  # fmt: skip
+    if played.forced:
+        lines.append(f"{played.forced} rows became final before their time, for want of room")
     if origin is not None:
         lines.append(f"times in seconds since {np.datetime_as_string(origin, timezone='UTC')}")
-    if result.lagged is not None:
+    if played.lagged is not None:
         lagged_path = out.with_suffix(f".lagged{out.suffix}")
-        write(result.lagged, lagged_path)
-        lines.append(f"{lagged_path}: {len(result.lagged.time)} rows, each given what came {lag:g} later")
-    return result.final, lines
+        write(played.lagged, lagged_path)
+        lines.append(f"{lagged_path}: {len(played.lagged.time)} rows, each given what came {lag:g} later")
+    return played.final, lines
 
 
 def _header(path: Path) -> list[str]:
@@ -185,16 +185,18 @@ def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndar
     """Return times and arrivals as numbers, and the date that they are counted from if they were dates."""
     parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
     first = columns[TIME][0]
+    # Dates, as seconds from the first of them.
     if hasattr(first, "isoformat") or looks_like_date(str(first)):
-        results = [dates(columns[part], f"{path}, column {part!r}") for part in parts]
-        for part, values in zip(parts, results, strict=True):
-            _refuse_missing(np.isnat(values), f"{path}, column {part!r}")
+        results = [dates(columns[column], f"{path}, column {column!r}") for column in parts]
+        for column, values in zip(parts, results, strict=True):
+            _refuse_missing(np.isnat(values), f"{path}, column {column!r}")
         origin: np.datetime64 = results[0].min()
         seconds = [(values - origin).astype(np.int64) / 1e9 for values in results]  # exact before they are floats
         return seconds[0], seconds[-1], origin
+    # Numbers as they are.
     numbers = [
-        np.array([_number(cell, f"{path}, row {row}, column {part!r}") for row, cell in enumerate(columns[part], 1)])
-        for part in parts
+        np.array([_number(cell, f"{path}, row {row}, column {name!r}") for row, cell in enumerate(columns[name], 1)])
+        for name in parts
     ]
     return numbers[0], numbers[-1], None
 
@@ -211,19 +213,19 @@ def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.nd
         parts = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
         if len(parts) != len(names):
             raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", shown(cell))
-        return np.array([_number(part, f"{where}, column {VALUES!r}", empty=True) for part in parts])
+        return np.array([_number(word, f"{where}, column {VALUES!r}", empty=True) for word in parts])
     return np.array([_number(row.get(name), f"{where}, column {name!r}", empty=True) for name in names])
 
 
 def _whole(cell: Any, name: str) -> int:
     """Return a count with every digit; a float is accepted if it is an exact integer."""
     try:
-        result = int(cell) if isinstance(cell, str) else cell
+        count = int(cell) if isinstance(cell, str) else cell
     except ValueError:
-        result = _number(cell, name)
-    if isinstance(result, float) and result.is_integer() and abs(result) < EXACT:
-        result = int(result)
-    return whole(name, result if isinstance(result, int) else cell)
+        count = _number(cell, name)
+    if isinstance(count, float) and count.is_integer() and abs(count) < EXACT:
+        count = int(count)
+    return whole(name, count if isinstance(count, int) else cell)
 
 
 def _number(cell: Any, name: str, empty: bool = False) -> float:
@@ -232,9 +234,9 @@ def _number(cell: Any, name: str, empty: bool = False) -> float:
     try:
         if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
             raise ValueError
-        result = float(cell)
+        number = float(cell)
     except (TypeError, ValueError, OverflowError):
-        result = np.inf
-    if np.isinf(result) or (np.isnan(result) and not empty):
+        number = np.inf
+    if np.isinf(number) or (np.isnan(number) and not empty):
         raise fail(name, "a number or an empty cell" if empty else "a number", shown(cell))
-    return result
+    return number

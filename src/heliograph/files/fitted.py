@@ -53,7 +53,7 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
         "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
-        "delays": {node: _delays(item) for node, item in fitted.delays.items()},
+        "delays": {node: _delays(delays) for node, delays in fitted.delays.items()},
         "sentences": list(fitted.sentences),
         "log_likelihood": dict(fitted.log_likelihood),
         "ends": [_plain(float(end)) for end in fitted.ends],
@@ -62,17 +62,17 @@ def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
     }
 
 
-def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, place: Path) -> None:
-    """Write `fitted.json` and `fitted_network.py` into a folder that will be renamed to `place`."""
+def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, target: Path) -> None:
+    """Write `fitted.json` and `fitted_network.py` into a folder that will be renamed to `target`."""
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     path, colon, name = _parts(reference)
     if path is None:
-        result = repr(reference)
+        source = repr(reference)
     else:
-        way = Path(os.path.relpath(path.resolve(), place.resolve())).as_posix()
-        result = f'f"{{HERE}}/{way}{colon}{name}"'
+        way = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
+        source = f'f"{{HERE}}/{way}{colon}{name}"'
     text = SOURCE.format(network=_docstring(reference), measurements=_docstring(measurements), fitted=FITTED,
-                         file=NETWORK, reference=result)  # fmt: skip
+                         file=NETWORK, reference=source)  # fmt: skip
     (folder / NETWORK).write_text(text, encoding="utf-8")
 
 
@@ -92,15 +92,15 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise fail(f"fitted numbers {path}", "a file that `heliograph fit` wrote", type(error).__name__) from None
-    known = {item.name: item.start.shape for item in description.parameters.every}
+    known = {parameter.name: parameter.start.shape for parameter in description.parameters.every}
     if {name: np.shape(value) for name, value in values.items()} != known:
         raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
     return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
 
 
-def _delays(item: Delays) -> dict[str, Any]:
-    shares = [{"steps": steps, **share._asdict()} for steps, share in item.shares.items()]
-    return {"step": item.step, "counted": item.counted, "early": item.early, "shares": shares}
+def _delays(delays: Delays) -> dict[str, Any]:
+    shares = [{"steps": steps, **share._asdict()} for steps, share in delays.shares.items()]
+    return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 
 
 def _plain(value: object) -> object:
@@ -109,11 +109,11 @@ def _plain(value: object) -> object:
 
 def _parts(reference: str) -> tuple[Path | None, str, str]:
     """Split a reference into path, colon and name; modules have no path."""
-    place, colon, name = reference.rpartition(":")
-    if not place or not name.isidentifier():
-        place, colon, name = reference, "", ""
-    is_file = place.endswith(".py") or os.sep in place or Path(place).is_file()
-    return (Path(place) if is_file else None), colon, name
+    module, colon, name = reference.rpartition(":")
+    if not module or not name.isidentifier():
+        module, colon, name = reference, "", ""
+    is_file = module.endswith(".py") or os.sep in module or Path(module).is_file()
+    return (Path(module) if is_file else None), colon, name
 
 
 def _docstring(text: str) -> str:

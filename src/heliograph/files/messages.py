@@ -29,7 +29,7 @@ def read_messages(path: str | Path, network: Network, sources: object, progress:
         path: the bag or the file.
         network: the network.
         sources: sources by topic, as `json_field` makes them.
-        progress: called with the numbers of messages read and to be read.
+        progress: called with the numbers of messages read and to be read (default none).
 
     Raises:
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
@@ -60,7 +60,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
-    result = EventTable(network, sources.step)
+    events = EventTable(network, sources.step)
     try:
         for number, row in _rows(path):
             where = f"{path}, row {number}"
@@ -72,15 +72,15 @@ def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
                 arrival = reading.time if logged is None else logged
                 if arrival is None:
                     raise fail(f"{where}, {topic}", f"a time field (time=...), or a column {ARRIVAL!r}", "neither")
-                result.add(reading, arrival)
+                events.add(reading, arrival)
     except InputError as error:
-        if not len(result):
+        if not len(events):
             raise
-        result.broken = f"{error}; what was read before it stays"
+        events.broken = f"{error}; what was read before it stays"
     if sources.unknown.total():
         counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
-        result.notes.append(f"{path}: not among the sources: {counts}")
-    return result
+        events.notes.append(f"{path}: not among the sources: {counts}")
+    return events
 
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:

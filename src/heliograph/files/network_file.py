@@ -38,20 +38,23 @@ def load_network(reference: str) -> Network:
 def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
     """Load a network as `load_network` does, and whatever else its module names, such as `sources` and `pose`."""
     file_path("network", reference)
-    place, _, name = str(reference).rpartition(":")
-    if not place or not name.isidentifier():  # no name, or the colon of a drive letter
-        place, name = reference, ""
-    if place.endswith(".py") or os.sep in place or Path(place).is_file():
-        path = Path(place)
+    source_name, _, name = str(reference).rpartition(":")
+    if not source_name or not name.isidentifier():  # no name, or the colon of a drive letter
+        source_name, name = reference, ""
+    # A file, by its path.
+    if source_name.endswith(".py") or os.sep in source_name or Path(source_name).is_file():
+        path = Path(source_name)
         if not path.is_file():
-            raise fail(f"network {place}", "a Python file", "a folder" if path.is_dir() else "nothing of that name")
+            got = "a folder" if path.is_dir() else "nothing of that name"
+            raise fail(f"network {source_name}", "a Python file", got)
         with _importing_from(path.parent):
-            module = _guarded(lambda: _run_file(path), place, path)
-            return _pick(module, name, place, path), vars(module)
+            module = _guarded(lambda: _run_file(path), source_name, path)
+            return _pick(module, name, source_name, path), vars(module)
+    # A module, by its name.
     with _importing_from(Path.cwd()):
-        source = _guarded(lambda: _source(place), place, None)
-        module = _guarded(lambda: importlib.import_module(place), place, source)
-        return _pick(module, name, place, source), vars(module)
+        source = _guarded(lambda: _source(source_name), source_name, None)
+        module = _guarded(lambda: importlib.import_module(source_name), source_name, source)
+        return _pick(module, name, source_name, source), vars(module)
 
 
 def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
@@ -63,50 +66,50 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     Raises:
         ValueError: as `load_network`; calling the function raises the same.
     """
-    place = f"{path.name}:{name}"
+    reference = f"{path.name}:{name}"
     # The module itself, then the function in it.
     with _importing_from(path.parent):
         module = _guarded(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
     if not callable(function):
         came = "an unknown name" if function is None else type(function).__name__
-        raise fail(f"network {place}", "a function that returns a heliograph.Network", came)
+        raise fail(f"network {reference}", "a function that returns a heliograph.Network", came)
 
     # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
         with _importing_from(path.parent):
-            network = _guarded(lambda: function(*args, **kwargs), place, path)
+            network = _guarded(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
-            raise fail(f"network {place}", "a heliograph.Network", type(network).__name__)
+            raise fail(f"network {reference}", "a heliograph.Network", type(network).__name__)
         return network
 
     return build
 
 
-def _pick(module: ModuleType, name: str, place: str, path: Path | None) -> Network:
+def _pick(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
-        return _named(module, name, place, path, networks)
+        return _named(module, name, file, path, networks)
     if len({id(network) for network in networks.values()}) == 1:
         return next(iter(networks.values()))
     if networks:
-        choices = " or ".join(f"{place}:{key}" for key in networks)
-        raise fail(f"network {place}", f"a name, as {choices}", f"none, and {len(networks)} networks")
-    raise fail(f"network {place}", f"a heliograph.Network (or {place}:FUNCTION that returns one)", "none in the module")
+        choices = " or ".join(f"{file}:{key}" for key in networks)
+        raise fail(f"network {file}", f"a name, as {choices}", f"none, and {len(networks)} networks")
+    raise fail(f"network {file}", f"a heliograph.Network (or {file}:FUNCTION that returns one)", "none in the module")
 
 
-def _named(module: ModuleType, name: str, place: str, path: Path | None, networks: dict[str, Network]) -> Network:
+def _named(module: ModuleType, name: str, file: str, path: Path | None, networks: dict[str, Network]) -> Network:
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
         holds = ", ".join(networks) or "no networks"
         hint = f" (closest: {close[0]!r})" if close else ""
-        raise fail(f"network {place}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}")
+        raise fail(f"network {file}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}")
     value = getattr(module, name)
     if callable(value) and not isinstance(value, Network):
-        value = _guarded(value, f"{place}:{name}", path)
+        value = _guarded(value, f"{file}:{name}", path)
     if not isinstance(value, Network):
-        raise fail(f"network {place}:{name}", "a heliograph.Network", type(value).__name__)
+        raise fail(f"network {file}:{name}", "a heliograph.Network", type(value).__name__)
     return value
 
 

@@ -90,13 +90,13 @@ def _truth_columns(network: Network) -> dict[str, str]:
 
 def _without_units(columns: Mapping[str, np.ndarray], network: Network) -> dict[str, np.ndarray]:
     """Return columns by name alone, where a header has the unit of its state, input or output: "range (m)"."""
-    received = [name for item in network.nodes.values() for name in item.received_names]
+    received = [name for node in network.nodes.values() for name in node.received_names]
     known = {with_unit(name): str(name) for name in (*network.states, *network.inputs, *received)}
     known |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
     known |= {
         f"{node}.{with_unit(name)}": f"{node}.{name}"
-        for node, item in network.nodes.items()
-        for name in item.received_names
+        for node, receiver in network.nodes.items()
+        for name in receiver.received_names
     }
     return {known.get(column, column): values for column, values in columns.items()}
 
@@ -146,7 +146,7 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
     several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
-            prefix = "".join(f"{part}." for part, used in zip((node, name), several, strict=True) if used)
+            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
             columns += [(prefix + key, values) for key, values in _claims(record.states, record.units, estimate)]
             later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in later:
@@ -182,12 +182,12 @@ def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate)
     mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
-    result = []
+    columns = []
     for i, state in enumerate(states):
-        result.append((_headed(state, units.get(state)), mean[:, i]))
+        columns.append((_headed(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
             variance = bound[:, i, i]
-            result.append(
+            columns.append(
                 (_headed(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
             )
     # Covariances of two states have the product of their units.
@@ -195,8 +195,8 @@ def _claims(states: Sequence[str], units: Mapping[str, str], estimate: Estimate)
         for i, a in enumerate(states):
             for j in range(i + 1, len(states)):
                 of = " ".join(units[name] for name in (a, states[j]) if name in units)
-                result.append((_headed(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
-    return [*result, ("valid", is_sound(estimate))]
+                columns.append((_headed(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+    return [*columns, ("valid", is_sound(estimate))]
 
 
 def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
@@ -207,7 +207,7 @@ def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
 
 def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     """Return the allowed column names of each node's components, the preferred one first."""
-    names = {node: item.received_names for node, item in network.nodes.items()}
+    names = {node: receiver.received_names for node, receiver in network.nodes.items()}
     uses = Counter([TIME, *network.inputs])
     for node, components in names.items():
         uses.update([*components, *(f"{node}.{name}" for name in components)])

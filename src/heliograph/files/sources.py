@@ -92,10 +92,10 @@ def json_field(
         path: dotted path of the value, or of several, which are then one measurement.
         node: name of a node of the network, or "inputs".
         output: name of the output or input, one for each path; None for all of the node's, in their order.
-        scale: factor, of all values or of each. Shape () or (values,).
-        offset: added after scaling, to all values or to each. Shape () or (values,).
+        scale: factor, of all values or of each. Shape () or (values,) (default 1).
+        offset: added after scaling, to all values or to each. Shape () or (values,) (default 0).
         time: dotted path of the time; None for the moment of arrival.
-        time_unit: unit of a time that is a number.
+        time_unit: unit of a time that is a number (default "s").
         sequence: dotted path of the node's running count; None if there is none.
         plant: dotted path of the plant's name; None if there is one plant.
         step: seconds of a step of a network that counts steps, where times are dates; None for any other.
@@ -173,7 +173,7 @@ class Sources:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
         if topic not in self._known:
             matching = [items for pattern, items in self._table.items() if matches(topic, pattern)]
-            self._known[topic] = [item for items in matching for item in items]
+            self._known[topic] = [source for items in matching for source in items]
         return self._known[topic]
 
     def read(self, topic: str, message: object, where: str) -> list[Reading]:
@@ -193,11 +193,11 @@ class Sources:
 
     def _reading(self, source: Source, places: np.ndarray, message: object, where: str) -> Reading:
         values = np.full(len(self.names[source.node]), np.nan)
-        for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+        for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
             value = at(message, path, where)
             if type(value) is not float:  # names its place only where there may be something to say
                 value = number(value, f"{where}, field {path!r}")
-            values[place] = scale * value + offset if isfinite(value) else np.nan
+            values[column] = scale * value + offset if isfinite(value) else np.nan
         # A time names its measurement; without one the count is left to the receiver.
         time = None
         if source.time is not None:
@@ -215,7 +215,7 @@ class Sources:
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", shown(topic))
         sources = [items] if isinstance(items, Source) else items
-        if not isinstance(sources, Sequence) or not all(isinstance(item, Source) for item in sources) or not sources:
+        if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", shown(items))
         return [(source, self._places(f"sources, {topic!r}", source)) for source in sources]
 
@@ -248,7 +248,7 @@ def matches(topic: str, pattern: str) -> bool:
     words, parts = topic.split("/"), pattern.split("/")
     if parts[-1] == "#":
         words, parts = words[: len(parts) - 1], parts[:-1]
-    return len(words) == len(parts) and all(part in ("+", word) for word, part in zip(words, parts, strict=True))
+    return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
 
 
 def at(message: object, path: str, where: str) -> Any:
@@ -291,10 +291,10 @@ def number(value: Any, name: str) -> float:
     if not isinstance(value, bool | int | float | np.number | np.bool_):
         raise fail(name, NUMBER, shown(value))
     try:
-        result = float(value)
+        numeric = float(value)
     except OverflowError:
         raise fail(name, NUMBER, shown(value)) from None
-    return result if np.isfinite(result) else np.nan
+    return numeric if np.isfinite(numeric) else np.nan
 
 
 def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
@@ -323,10 +323,10 @@ def nanoseconds(value: Any, unit: TimeUnit, name: str) -> int:
         raise fail(name, "a time: a date with its zone, a stamp, or a number", shown(value))
     if unit == "step":
         return _count(value, name)
-    result = int(value) * UNITS[unit] if float(value).is_integer() else round(float(value) * UNITS[unit])
-    if not 0 < result < 2**63:
+    stamp = int(value) * UNITS[unit] if float(value).is_integer() else round(float(value) * UNITS[unit])
+    if not 0 < stamp < 2**63:
         raise fail(name, "a time that was set, since 1970 (without time= it is the moment of arrival)", shown(value))
-    return result
+    return stamp
 
 
 def _count(value: Any, name: str) -> int:
@@ -337,7 +337,7 @@ def _count(value: Any, name: str) -> int:
 
 def _texts(name: str, value: str | Sequence[str]) -> tuple[str, ...]:
     items = [value] if isinstance(value, str) else value
-    if not isinstance(items, Sequence) or not all(isinstance(item, str) for item in items):
+    if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
         raise fail(f"json_field, {name}", "a text, or a list of texts", shown(value))
     return tuple(items)
 
@@ -347,7 +347,7 @@ def _per_path(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
     values = np.atleast_1d(np.asarray(value, dtype=object))
     if values.ndim != 1 or len(values) not in (1, count):
         raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value))
-    numbers = [float(scalar(f"json_field, {name}", item)) for item in values]
+    numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
     return tuple(numbers * (count if len(numbers) == 1 else 1))
 
 

@@ -43,26 +43,26 @@ def _values(values: Any, name: str) -> np.ndarray:
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
-    result = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
-    if result.dtype.kind == "M":
-        return np.asarray(result.astype("datetime64[ns]"))
-    if result.dtype.kind in "fiub":
-        return np.asarray(result, dtype=np.float64)
-    if result.dtype.kind in "OUT":
-        return _of_objects(result, name)
-    raise fail(name, "numbers or dates", f"{result.dtype}")
+    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
+    if column.dtype.kind == "M":
+        return np.asarray(column.astype("datetime64[ns]"))
+    if column.dtype.kind in "fiub":
+        return np.asarray(column, dtype=np.float64)
+    if column.dtype.kind in "OUT":
+        return _of_objects(column, name)
+    raise fail(name, "numbers or dates", f"{column.dtype}")
 
 
-def _of_objects(result: np.ndarray, name: str) -> np.ndarray:
+def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
     """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
-    some = next((item for item in result if item is not None), None)
+    some = next((value for value in column if value is not None), None)
     if isinstance(some, str) or hasattr(some, "isoformat"):
-        return dates(result, name)
-    texts = [item for item in result if isinstance(item, str | bytes)]  # text is no number, though it may read as one
+        return dates(column, name)
+    texts = [x for x in column if isinstance(x, str | bytes)]  # text is no number, though it may read as one
     try:
         if texts:
             raise TypeError
-        return np.array([np.nan if item is None else float(item) for item in result])
+        return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
         raise fail(name, "numbers or dates", shown(texts[0] if texts else some)) from None
 

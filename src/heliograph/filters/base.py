@@ -241,12 +241,20 @@ def _step_with_smoother(
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it."""
+    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it.
+
+    Args:
+        predict: the method of a filter, which gets arrays of the filter's sizes.
+    """
     return _checked(predict, given)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it."""
+    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it.
+
+    Args:
+        correct: the method of a filter, which gets arrays of the filter's sizes.
+    """
     return _checked(correct, measured)
 
 
@@ -267,18 +275,18 @@ def measured(filter: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
 
     Empty for a filter that uses no measurements.
     """
-    result = _numbers("measurement", z, filter.received or None)
-    if isinstance(result, np.ndarray) and np.isinf(result).any():
-        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(result).tolist())
-    return result if filter.received else result[:0]
+    values = _numbers("measurement", z, filter.received or None)
+    if isinstance(values, np.ndarray) and np.isinf(values).any():
+        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(values).tolist())
+    return values if filter.received else values[:0]
 
 
 def given(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     """Return u as an input of the filter's length."""
-    result = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
-    if isinstance(result, np.ndarray) and not np.isfinite(result).all():
-        raise fail("inputs", "finite numbers", np.asarray(result).tolist())
-    return result
+    values = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
+    if isinstance(values, np.ndarray) and not np.isfinite(values).all():
+        raise fail("inputs", "finite numbers", np.asarray(values).tolist())
+    return values
 
 
 def step_number(filter: AbstractFilter, k: Step) -> Step:
@@ -303,18 +311,18 @@ def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " 
     """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
     try:
-        result: Array = np.asarray(value)
+        numbers: Array = np.asarray(value)
     except jax.errors.TracerArrayConversionError:
-        result = jnp.asarray(value, dtype=float)
+        numbers = jnp.asarray(value, dtype=float)
     except ValueError:  # rows of different lengths
         raise fail(name, expected, repr(value)[:60]) from None
     # Concrete values: real numbers only, in double precision.
-    if isinstance(result, np.ndarray):
-        if result.dtype.kind not in "fiub":
+    if isinstance(numbers, np.ndarray):
+        if numbers.dtype.kind not in "fiub":
             raise fail(name, expected, repr(value)[:60])
-        result = result.astype(np.float64)
+        numbers = numbers.astype(np.float64)
     # A scalar stands for a vector of length one.
-    result = result[None] if result.ndim == 0 and length in (1, None) else result
-    if result.ndim != 1 or length not in (len(result), None):
-        raise fail(name, expected, f"shape {result.shape}" if result.size else "none")
-    return result
+    numbers = numbers[None] if numbers.ndim == 0 and length in (1, None) else numbers
+    if numbers.ndim != 1 or length not in (len(numbers), None):
+        raise fail(name, expected, f"shape {numbers.shape}" if numbers.size else "none")
+    return numbers

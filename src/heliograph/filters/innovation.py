@@ -203,7 +203,7 @@ def summarise_innovations(innovations: Weighed) -> tuple[InnovationSummary, ...]
     Args:
         innovations: value, variance and weight (time, m), NaN where nothing arrived.
     """
-    return tuple(_summary(*columns) for columns in zip(*(np.asarray(part).T for part in innovations), strict=True))
+    return tuple(_summary(*columns) for columns in zip(*(np.asarray(column).T for column in innovations), strict=True))
 
 
 def _summary(value: Float[np.ndarray, " time"], variance: np.ndarray, weight: np.ndarray) -> InnovationSummary:
@@ -242,7 +242,7 @@ def outlying(summaries: tuple[InnovationSummary, ...]) -> list[int]:
 
     Source: Newcombe, Interval estimation for the difference between independent proportions (1998), method 10.
     """
-    result = []
+    outliers = []
     for i, summary in enumerate(summaries):
         others = [other for j, other in enumerate(summaries) if j != i and other.received]
         if not summary.received or not others:
@@ -252,5 +252,5 @@ def outlying(summaries: tuple[InnovationSummary, ...]) -> list[int]:
         rest = wilson(pooled * independent, independent)
         share = summary.share
         if share.estimate - pooled > np.hypot(share.estimate - share.low, rest.high - pooled):
-            result.append(i)
-    return result
+            outliers.append(i)
+    return outliers

@@ -146,8 +146,8 @@ def judge(
 
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
-    part, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
-    free = jnp.where(larger & ~determined, part, 0.0)
+    squares, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
+    free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
     far = _some((free > most) | (larger & jnp.isinf(value))) | (_total(free) > most)
     # Excluded: all determined, and one of them differs.

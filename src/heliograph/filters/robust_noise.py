@@ -112,17 +112,15 @@ def split(channel: AbstractRandomAffine) -> SplitChannel:
             return SplitChannel(GainAndNoise(channel.law, channel.matrix, still), channel.noise)
         case Series():
             *before, last = channel.maps
-            part = split(last)
-            return (
-                SplitChannel(Series([*before, part.plain]), part.noise) if part.noise else SplitChannel(channel, None)
-            )
+            end = split(last)
+            return SplitChannel(Series([*before, end.plain]), end.noise) if end.noise else SplitChannel(channel, None)
         case Stack():
             # Parallel links are split one by one; one without outliers has no noise to take.
-            parts = [split(affine) for affine in channel.maps]
-            if not any(part.noise for part in parts):
+            links = [split(affine) for affine in channel.maps]
+            if not any(link.noise for link in links):
                 return SplitChannel(channel, None)
-            noises = [part.noise or Gaussian(np.zeros((part.plain.outputs,) * 2)) for part in parts]
-            return SplitChannel(Stack([part.plain for part in parts]), Independent(noises))
+            noises = [link.noise or Gaussian(np.zeros((link.plain.outputs,) * 2)) for link in links]
+            return SplitChannel(Stack([link.plain for link in links]), Independent(noises))
     return SplitChannel(channel, None)
 
 
@@ -136,13 +134,13 @@ def received(
     Raises:
         ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
     """
-    steps = max((item.steps for item in (sensor, channel) if isinstance(item, OverTime)), default=None)
+    steps = max((model.steps for model in (sensor, channel) if isinstance(model, OverTime)), default=None)
     if steps is None:
-        parts = split(first(channel))
-        plain = Polytope().describe(parts.plain)
-        return plain, received_noise(first(sensor).noise, parts.noise, plain, apart)
+        parted = split(first(channel))
+        plain = Polytope().describe(parted.plain)
+        return plain, received_noise(first(sensor).noise, parted.noise, plain, apart)
     channels = unstack(channel) if isinstance(channel, OverTime) else [channel] * steps
-    pieces = [split(item) for item in channels]
+    pieces = [split(step) for step in channels]
     plains = [Polytope().describe(piece.plain) for piece in pieces]
     noises = [
         received_noise(at(sensor, k).noise, piece.noise, plain, apart)
@@ -169,7 +167,7 @@ def received_noise(sensed: AbstractNoise, late: AbstractNoise | None, plain: Sec
         covariance, center = covariance + last.covariance, center + last.mean
     _check(covariance, apart)
     # Branches of the sensor's noise, and their pairs with those of the last hop's.
-    log_share, mean, variance = (part[source] for part in branches(sensed))
+    log_share, mean, variance = (values[source] for values in branches(sensed))
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
@@ -231,8 +229,8 @@ def _pairs(sensed: Branches, late: Branches) -> tuple[Array, ...]:
 
     def every(value: Array, first: bool) -> Array:
         wide = value[:, :, None] if first else value[:, None]
-        result: Array = xp.broadcast_to(wide, shape).reshape(shape[0], -1)
-        return result
+        flat: Array = xp.broadcast_to(wide, shape).reshape(shape[0], -1)
+        return flat
 
     shares = every(sensed.log_share, True) + every(late.log_share, False)
     return (shares, every(sensed.mean, True), every(sensed.variance, True), every(late.mean, False),
@@ -243,9 +241,9 @@ def _degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
     """Student's degrees of each output; NaN where the noise has another law."""
     parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
-        part.degrees * np.ones(part.dimension) if isinstance(part, StudentT) and late is None
-        else np.full(part.dimension, np.nan)
-        for part in parts
+        component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None
+        else np.full(component.dimension, np.nan)
+        for component in parts
     ]  # fmt: skip
-    result: Vector = library(values).concatenate(values)
-    return result
+    degrees: Vector = library(values).concatenate(values)
+    return degrees

@@ -53,14 +53,14 @@ def over_rows(
     filter: "AbstractFilter",
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
-    result: Callable[[PyTree, Innovation, jax.Array], PyTree],
+    output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
-    """Step a filter over rows inside a compiled computation: result(state, innovation, k) of each, stacked."""
+    """Step a filter over rows inside a compiled computation: output(state, innovation, k) of each, stacked."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         k, z_k, u_k = row
         after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
-        return after, result(after, innovation, k)
+        return after, output(after, innovation, k)
 
     start = jax.tree.map(jnp.asarray, filter.init())
     return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
@@ -112,5 +112,5 @@ def rows(
     except (TypeError, ValueError):
         raise fail(name, "an array of numbers", repr(value)[:60]) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values
-    result: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
-    return result
+    table: Float[Array, "steps n"] = array(name, values, (steps, length), missing=missing)
+    return table

@@ -84,9 +84,9 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowle
     """Return the state before the first report, for so many `delays` and `received` numbers per report."""
     nodes, n = errors.bias.shape
     size = nodes * n
-    local, joint = errors.local.reshape(size, n), errors.joint.reshape(size, size)
+    cross, joint = errors.with_state.reshape(size, n), errors.joint.reshape(size, size)
     later = (0, size * delays)
-    covariance = jnp.pad(jnp.block([[errors.covariance, local.T], [local, joint]]), (later, later))
+    covariance = jnp.pad(jnp.block([[errors.covariance, cross.T], [cross, joint]]), (later, later))
     mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), later)
     shapes = (received, n), (received,), (received, received), (n,)
     past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
@@ -176,9 +176,10 @@ def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     errors = happened.errors
     mean = errors.mean - errors.bias
     blocks = jnp.einsum("iaib->iab", errors.joint)
-    second = (
-        errors.covariance - errors.local - jnp.swapaxes(errors.local, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
-    )
+    # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
+    both = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
+    second = errors.covariance - both + blocks + mean[:, :, None] * mean[:, None]
+    # Noise of the reports: the spread of the links on what is sent, and the quantizers' error.
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))

@@ -45,13 +45,13 @@ class Observation(NamedTuple):
 class Errors(NamedTuple):
     """Moments of the plant's state x and of the errors e_i = x - m_i, before any data.
 
-    mean E x and covariance Cov x; bias E e_i; local Cov(e_i, x); joint Cov(e_i, e_j).
+    mean E x and covariance Cov x; bias E e_i; with_state Cov(e_i, x); joint Cov(e_i, e_j).
     """
 
     mean: Float[jax.Array, " n"]
     covariance: Float[jax.Array, "n n"]
     bias: Float[jax.Array, "node n"]
-    local: Float[jax.Array, "node n n"]
+    with_state: Float[jax.Array, "node n n"]
     joint: Float[jax.Array, "node n node n"]
 
 
@@ -74,18 +74,18 @@ def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], st
     return Errors(mean, covariance, mean - starts, values, joint)
 
 
-def error_step(local: Plan, motion: Motion, observation: Observation) -> ErrorStep:
-    """Recursion of the errors of linear filters; `local` has a leading axis of nodes."""
-    gain, identity = jnp.asarray(local.gain), jnp.eye(motion.matrix.shape[-1])
-    keep = identity - gain @ local.output
-    astray = gain @ _difference(observation.gain, local.output)
-    moves = _difference(jnp.broadcast_to(motion.matrix, local.transition.shape), local.transition)
-    shifts = _difference(jnp.broadcast_to(motion.shift, local.drift.shape), local.drift)
+def error_step(plan: Plan, motion: Motion, observation: Observation) -> ErrorStep:
+    """Recursion of the errors of linear filters; `plan` has a leading axis of nodes."""
+    gain, identity = jnp.asarray(plan.gain), jnp.eye(motion.matrix.shape[-1])
+    keep = identity - gain @ plan.output
+    astray = gain @ _difference(observation.gain, plan.output)
+    moves = _difference(jnp.broadcast_to(motion.matrix, plan.transition.shape), plan.transition)
+    shifts = _difference(jnp.broadcast_to(motion.shift, plan.drift.shape), plan.drift)
     drift = _times(keep, shifts) - astray @ jnp.asarray(motion.shift)
     return ErrorStep(
-        transition=keep @ local.transition,
+        transition=keep @ plan.transition,
         of_state=keep @ moves - astray @ motion.matrix,
-        drift=drift - _times(gain, _difference(observation.offset, local.offset)),
+        drift=drift - _times(gain, _difference(observation.offset, plan.offset)),
         of_noise=keep - astray,
         gain=gain,
     )
@@ -105,7 +105,7 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
     mean, covariance = moved_state(errors.mean, errors.covariance, motion)
     bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
     # Cov(e+, x+): the errors depend on x where a filter's model is wrong.
-    carried = step.transition @ errors.local  # Cov(T e, x)
+    carried = step.transition @ errors.with_state  # Cov(T e, x)
     of_state = step.of_state @ errors.covariance
     of_noise = step.of_noise @ motion.noise
     moved = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
@@ -123,15 +123,15 @@ class Factors(NamedTuple):
     """Moments of the errors by their sources: x = E x + state s, e_i = E e_i + shared_i s + a_i, Cov s = I.
 
     s are x_0 and the process noise of each step, and the channels' noise where nodes share it; a_i is independent, of
-    covariance local_i. So Cov(e_i, e_j) = shared_i shared_j' + (local_i if i is j): a step costs in proportion to the
-    nodes, not to pairs of them.
+    covariance independent_i. So Cov(e_i, e_j) = shared_i shared_j' + (independent_i if i is j): a step costs in
+    proportion to the nodes, not to pairs of them.
     """
 
     mean: Float[jax.Array, " n"]
     state: Float[jax.Array, "n sources"]
     bias: Float[jax.Array, "node n"]
     shared: Float[jax.Array, "node n sources"]
-    local: Float[jax.Array, "node n n"]
+    independent: Float[jax.Array, "node n n"]
 
 
 def initial_factors(errors: Errors, sources: int) -> Factors:
@@ -150,9 +150,9 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
     state = jnp.asarray(motion.matrix) @ factors.state
     shared = step.transition @ factors.shared + step.of_state @ factors.state
     bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
-    moved = step.transition @ factors.local @ jnp.swapaxes(step.transition, 1, 2)
+    moved = step.transition @ factors.independent @ jnp.swapaxes(step.transition, 1, 2)
     new = step.of_noise @ root
-    # Shared measurement noise is a source, independent noise is local.
+    # Shared measurement noise is a source, independent noise stays the node's.
     if noise.ndim == 4:
         m = noise.shape[1]
         received = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
@@ -161,28 +161,28 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
     else:
         moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
     # The new sources of step k go to columns of their own.
-    place = n + new.shape[-1] * k
+    column = n + new.shape[-1] * k
     return Factors(
         jnp.asarray(motion.matrix) @ factors.mean + motion.shift,
-        jax.lax.dynamic_update_slice(state, root, (0, place)),
+        jax.lax.dynamic_update_slice(state, root, (0, column)),
         bias,
-        jax.lax.dynamic_update_slice(shared, new, (0, 0, place)),
+        jax.lax.dynamic_update_slice(shared, new, (0, 0, column)),
         moved,
     )
 
 
-def joint_of(shared: Array, local: Array) -> Float[Array, "node n node n"]:
+def joint_of(shared: Array, independent: Array) -> Float[Array, "node n node n"]:
     """Cov(e_i, e_j) of all pairs, of errors e_i = shared_i s + a_i."""
     count, n, _ = shared.shape
     flat = shared.reshape(count * n, -1)
-    apart = np.eye(count)[:, None, :, None] * local[:, :, None]
+    apart = np.eye(count)[:, None, :, None] * independent[:, :, None]
     return (flat @ flat.T).reshape(count, n, count, n) + apart
 
 
-def weighted_sources(weights: Array, shared: Array, local: Array) -> tuple[Array, Array]:
+def weighted_sources(weights: Array, shared: Array, independent: Array) -> tuple[Array, Array]:
     """Sources (n, sources) of a weighted sum of the errors, and the covariance (n, n) of its independent part."""
-    jnp = library(weights, shared, local)
-    return jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, local, weights)
+    jnp = library(weights, shared, independent)
+    return jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, independent, weights)
 
 
 def observation_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:

@@ -115,8 +115,8 @@ class AbstractWeights(AbstractInformedFusion):
 
 def with_mean(errors: Errors) -> Joint:
     """Joint covariance of the errors and of x - E x, the error of the plant's mean."""
-    column = errors.local[:, :, None, :]
-    last = jnp.concatenate([jnp.moveaxis(errors.local, 2, 0), errors.covariance[:, None, :]], axis=1)
+    column = errors.with_state[:, :, None, :]
+    last = jnp.concatenate([jnp.moveaxis(errors.with_state, 2, 0), errors.covariance[:, None, :]], axis=1)
     return jnp.concatenate([jnp.concatenate([errors.joint, column], axis=2), last[None]], axis=0)
 
 

@@ -215,7 +215,7 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
 @runs_last
 def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
     _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
-    none = jnp.stack([jnp.where((s == 0) | (s**2 * item > 1), 1.0, 0.0) for s, item in zip(scales, least, strict=True)])
+    none = jnp.stack([jnp.where((s == 0) | (s**2 * low > 1), 1.0, 0.0) for s, low in zip(scales, least, strict=True)])
     return inverse(a + diagonal(none * least))
 
 

@@ -118,16 +118,16 @@ def levels_of(value: int) -> Float[np.ndarray, ""]:
 def parameter(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter as a number, or as one number per component."""
     several = isinstance(value, Sequence) or np.ndim(value) > 0
-    result: Parameter = array(name, value, (None,) if several else ())
-    return result
+    numbers: Parameter = array(name, value, (None,) if several else ())
+    return numbers
 
 
 def positive(name: str, value: ArrayLike) -> Parameter:
     """Return a parameter that is positive."""
-    result = parameter(name, value)
-    if not isinstance(result, jax.Array) and np.any(result <= 0):
+    numbers = parameter(name, value)
+    if not isinstance(numbers, jax.Array) and np.any(numbers <= 0):
         raise fail(name, "positive numbers", value)
-    return result
+    return numbers
 
 
 def check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
@@ -181,8 +181,8 @@ class UniformQuantizer(AbstractQuantizer):
     def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment's length."""
         half = self.scale * self.amplitude / self.levels
-        result: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
-        return result
+        bound: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
+        return bound
 
     def claim(self, claim: Claim) -> Claim:
         """Lower a claim to "upper" at most."""

@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
-from heliograph.numerics.check import array, check_count, fail, instance, items, probabilities, scalar
+from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -100,8 +100,8 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] 
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
     instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
-    for item in (estimates := items("fusion", estimates, "estimates")):
-        instance("fusion", item, Estimate, "estimates")
+    for estimate in (estimates := items("fusion", estimates, "estimates")):
+        instance("fusion", estimate, Estimate, "estimates")
     if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
@@ -282,7 +282,8 @@ class Fusion(Module):
         rule: the fusion rule.
         quantizer: of each node's mean on its way to the fusion centre or to its neighbours; one for all nodes, or one
             for each by its name, all of one kind; None by default. The covariance is widened by the quantizer's error.
-            Covariances are assumed to arrive as they are: most are computed before any data.
+            Between neighbours a mean beyond its amplitude does not arrive, and the claim is "nominal". Covariances are
+            assumed to arrive as they are: most are computed before any data.
         uplink: the link of the quantized mean, for rules that use reports (`AllReports`); one for all nodes, or one for
             each node by its name; None by default.
         neighbours: names of those whom each node receives, such as {"a": ["b", "c"], "b": []}, or a networkx graph of
@@ -336,15 +337,13 @@ class Fusion(Module):
     def check(self, nodes: Sequence[str], n: int) -> None:
         """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
         self.rule.check(len(nodes))
-        if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
-            raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
-        for item in self._quantizers(nodes):
-            if not isinstance(first(item), AbstractQuantizer):
-                raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
-            first(item).check(n)
-            if first(item).silent and not self.rule.uses_reports:
+        for quantizer in self._quantizers(nodes):
+            if not isinstance(first(quantizer), AbstractQuantizer):
+                raise fail("quantizer", "an AbstractQuantizer", type(quantizer).__name__)
+            first(quantizer).check(n)
+            if first(quantizer).silent and not self.rule.uses_reports:
                 expected = "a rule that uses reports (AllReports)"
-                raise fail(f"fusion through {type(first(item)).__name__}", expected, type(self.rule).__name__)
+                raise fail(f"fusion through {type(first(quantizer)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
             self._check_reports(nodes, n)
         self.uplinks(nodes)
@@ -357,24 +356,20 @@ class Fusion(Module):
     def _check_reports(self, nodes: Sequence[str], n: int) -> None:
         if not self.rule.uses_reports:
             raise fail("fusion over report links", "a rule that uses reports (AllReports)", type(self.rule).__name__)
-        if isinstance(self.uplink, Mapping) and set(self.uplink) != set(nodes):
-            raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
         for link in self.links(nodes):
             instance("report link", link, ReportLink, "a ReportLink").check(n)
-        for item in self._quantizers(nodes):
-            if isinstance(item, OverTime):
+        for quantizer in self._quantizers(nodes):
+            if isinstance(quantizer, OverTime):
                 raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
-            item.error(n)
+            quantizer.error(n)
 
     def links(self, nodes: Sequence[str]) -> list[ReportLink]:
         """Report links of these nodes."""
-        if self.uplink is None:
-            return [ReportLink()] * len(nodes)
-        return [self.uplink[n] if isinstance(self.uplink, Mapping) else self.uplink for n in nodes]
+        return of_each("report links", ReportLink() if self.uplink is None else self.uplink, nodes)
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
         """Quantizers of these nodes' reports, which do not vary over time; an empty list without."""
-        return [item for item in self._quantizers(nodes) if isinstance(item, AbstractQuantizer)]
+        return [quantizer for quantizer in self._quantizers(nodes) if isinstance(quantizer, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
         """Quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
@@ -393,6 +388,4 @@ class Fusion(Module):
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
-        if self.quantizer is None:
-            return []
-        return [self.quantizer[n] if isinstance(self.quantizer, Mapping) else self.quantizer for n in nodes]
+        return [] if self.quantizer is None else of_each("quantizers", self.quantizer, nodes)

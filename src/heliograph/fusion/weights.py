@@ -41,6 +41,9 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
     given. D is the mean of the estimates' variances, so units do not matter; one rank rule, on correlations.
 
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+
     Source: Rao, Linear Statistical Inference and its Applications (1973), 4i.4, the unified theory of least squares.
     """
     nodes, n = joint.shape[:2]
@@ -52,14 +55,14 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     # U = P + E E' in these units.
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    result = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
-    weights = regular_solve(result @ ones, result).reshape(n, nodes, n)
+    unscaled = pseudo_solve(total, ones, rounding(0.0, total, RANK)).T  # E' U^+
+    weights = regular_solve(unscaled @ ones, unscaled).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
 @compiled
 def factored_weights(
-    shared: Float[Array, "node n sources"], local: Float[Array, "node n n"]
+    shared: Float[Array, "node n sources"], independent: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
     """Matrix weights of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
@@ -67,7 +70,7 @@ def factored_weights(
     """
     nodes, n, sources = shared.shape
     # Whitened by B: L and E.
-    factors = jnp.linalg.cholesky(jnp.asarray(local))
+    factors = jnp.linalg.cholesky(jnp.asarray(independent))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
     common, e = white[:, :sources], white[:, sources:]
@@ -86,17 +89,25 @@ def factored_weights(
 @_of_joint
 @compiled
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n)."""
+    """Diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
+
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+    """
     nodes, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", jnp.asarray(joint))
-    items = jax.vmap(lambda item: matrix_weights(item.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
-    return jnp.einsum("ai,ab->aib", items, jnp.eye(n))
+    weights = jax.vmap(lambda block: matrix_weights(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
+    return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
 
 
 @_of_joint
 @compiled
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n)."""
+    """Scalar weights: one number per estimate, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
+
+    Args:
+        joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
+    """
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
     by_node = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
@@ -114,6 +125,9 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
     linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
 
+    Args:
+        levels: gamma_i of the nodes (N,), positive.
+
     Raises:
         ValueError: levels that are not positive.
 
@@ -129,6 +143,10 @@ def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"])
 
     The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
     the gamma_i, `weights` (N,) the c_i.
+
+    Args:
+        levels: gamma_i of the nodes (N,), positive.
+        weights: c_i (N,), not negative, of sum 1.
 
     Raises:
         ValueError: levels that are not positive, weights off the simplex or not as many.

@@ -72,7 +72,7 @@ def certify_level(
         weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
         multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~.
         level: gamma, a positive ratio of norms.
-        growth: results of `check_growth`; constants that none of them proves are listed as assumed.
+        growth: results of `check_growth`; constants that none of them proves are listed as assumed (default none).
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
@@ -80,7 +80,7 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level))
-    growth = [instance("growth", item, GrowthFinding, FINDINGS) for item in items("growth", growth, FINDINGS)]
+    growth = [instance("growth", finding, GrowthFinding, FINDINGS) for finding in items("growth", growth, FINDINGS)]
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)
@@ -139,12 +139,12 @@ def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
 
 def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> tuple[str, ...]:
     """List the constants that no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
-    result = []
+    assumed = []
     for value, what in constants:
         about = [finding for finding in growth if _supports(finding, value)]
         if not about or not all(finding.proved for finding in about):
-            result.append(f"{what} with a = {value:g}")
-    return tuple(result)
+            assumed.append(f"{what} with a = {value:g}")
+    return tuple(assumed)
 
 
 def theorem_matrix(
@@ -172,10 +172,10 @@ def theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
-        result = np.zeros((height, q))
+        wide = np.zeros((height, q))
         for name, block in blocks.items():
-            result[:, at[name] : at[name] + block.shape[1]] = block
-        return result
+            wide[:, at[name] : at[name] + block.shape[1]] = block
+        return wide
 
     # V eta, E[G] (C xhat + h(xhat)) and R eta
     signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])

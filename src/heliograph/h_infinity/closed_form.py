@@ -58,14 +58,14 @@ def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, 
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
     # step by step: K and P2 in closed form, P1 small enough that it does no harm
     for k, step in enumerate(step_matrices(system, separate=True)):
-        result = _best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
-        if result is None:
+        gain_and_error = _best_gain(system, step, weights[k, n:, n:], inner, multipliers[k])
+        if gain_and_error is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
-        gains[k], error = result
-        state, local = _state_weight(system, k, state)
+        gains[k], error = gain_and_error
+        state, of_growth = _state_weight(system, k, state)
         weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
-        design.multipliers[k] = [local[0], multipliers[k, 0], local[1], multipliers[k, 1]]
+        design.multipliers[k] = [of_growth[0], multipliers[k, 0], of_growth[1], multipliers[k, 1]]
     return design._replace(feasible=True, status="optimal")
 
 

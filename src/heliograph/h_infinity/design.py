@@ -87,10 +87,11 @@ def recursive_design(
         initial: P_0 (2n, 2n); the largest allowed, level^2 W, by default.
         objective: which P_s+1 to take: "trace" the smallest tr L (this and the next in coordinates of order one where
             no growth makes lengths comparable), "largest_eigenvalue" that of L and among those the smallest tr L,
-            "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end.
-        solver: "clarabel" (interior point) or "scs" (first order).
-        separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative.
-        search: look for the smallest level if the given one fails.
+            "log_determinant" the largest log det P, "none" the first that the solver meets, often a dead end (default
+            "trace").
+        solver: "clarabel" (interior point) or "scs" (first order) (default "clarabel").
+        separate: one multiplier for each of f, f~, h, h~ in place of two, which is less conservative (default False).
+        search: look for the smallest level if the given one fails (default True).
 
     Raises:
         ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape,
@@ -131,10 +132,10 @@ def horizon_design(
 
     Args:
         system: the system, from `growth_system`.
-        separate: one multiplier for each of f, f~, h, h~ in place of two; never worse.
+        separate: one multiplier for each of f, f~, h, h~ in place of two; never worse (default False).
         gains: K (steps, n, m), to find the smallest level that can be proven for these; free by default.
         initial: P_0 (2n, 2n); by default the largest allowed, level^2 W, which is never worse than another.
-        solver: "clarabel" or "scs".
+        solver: "clarabel" or "scs" (default "clarabel").
 
     Raises:
         ValueError: an unknown solver, gains or an initial weight of the wrong shape.
@@ -158,8 +159,8 @@ def horizon_design(
     if not status.startswith("optimal") or values is None:
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     # the solver's answer must satisfy every step's inequality itself
-    parts = [np.asarray(values[place]) for place in problem.places]
-    solved = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
+    parts = [np.asarray(values[entries]) for entries in problem.places]
+    solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
     weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, solved)]
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
@@ -203,21 +204,21 @@ class _Recursion:
         for k, step in enumerate(self.steps):
             fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
-            status, result = self._problem(k, present if k == 0 else None).solve(fixed)
-            if result is None or not _holds(step, result, fixed, SCREEN):
+            status, unknowns = self._problem(k, present if k == 0 else None).solve(fixed)
+            if unknowns is None or not _holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _block(result)
-            design.gains[k] = c.gain(step.nominal + _gain(result), k)
+            present = _block(unknowns)
+            design.gains[k] = c.gain(step.nominal + _gain(unknowns), k)
             design.weights[k + 1] = relative * c.weight(present, k + 1)
-            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(result, k), self.separate)
+            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(unknowns, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
         coupling = _coupling(start, self.system.states)
-        for item, single, coupled, problem in self.compiled:
-            if all(map(np.array_equal, item, step)) and single == sizes and coupled is coupling is None:
+        for matrices, single, coupled, problem in self.compiled:
+            if all(map(np.array_equal, matrices, step)) and single == sizes and coupled is coupling is None:
                 return problem
         problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
         self.compiled.append((step, sizes, coupling, problem))

@@ -93,8 +93,8 @@ class GrowthFinding(NamedTuple):
             why = self.reason or (
                 "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
             )
-            result = f"not refuted {where} (largest slope {self.slope:.6g})"
-            return f"{self.name}: constant {self.constant:g} is assumed: {result}; {why}"
+            verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
+            return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {why}"
         return f"{self.name}: constant {self.constant:g} is false {where}: {self._evidence()}"
 
     def _evidence(self) -> str:
@@ -130,7 +130,7 @@ def check_growth(
         name: the function's name in sentences; "f" by default.
         seed: seed of the search; 0 by default.
         differences: False for the weaker condition on f itself, |f(x)| <= a |x|: pairs with 0, which has to be in the
-            box.
+            box (default True).
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
@@ -219,14 +219,14 @@ def _finding(
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
     best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[pair], 2)
-    result = GrowthFinding(
+    finding = GrowthFinding(
         name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair]),
         tools.at_zero(len(low)), None, "", differences,
     )  # fmt: skip
-    if result.refuted:
-        return result
-    bound = slope_bound(tools.function, low, high, result.limit)
-    return result._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
+    if finding.refuted:
+        return finding
+    bound = slope_bound(tools.function, low, high, finding.limit)
+    return finding._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 
 def _climb(
@@ -243,8 +243,8 @@ def _climb(
         moved = best[:, None] + size * random.normal(size=(len(best), TRIALS, len(low)))
         moved[:, 0] = best
         moved = np.clip(moved, low, high)
-        result = objective(moved.reshape(-1, len(low))).reshape(len(best), TRIALS)
-        best = moved[np.arange(len(best)), result.argmax(axis=1)]
+        values = objective(moved.reshape(-1, len(low))).reshape(len(best), TRIALS)
+        best = moved[np.arange(len(best)), values.argmax(axis=1)]
         size = SHRINK * size
     return best
 
@@ -302,12 +302,12 @@ def _sharpened(
 def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, " boxes"]:
     short = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], short, axis=0)]) for end in (low, high)]
-    (result,) = evaluate(slopes, [Interval(*ends)], continuous=False)
-    finite = np.isfinite(result.low) & np.isfinite(result.high)
-    a, b = np.where(finite, result.low, 0.0), np.where(finite, result.high, 0.0)
+    (bounded,) = evaluate(slopes, [Interval(*ends)], continuous=False)
+    finite = np.isfinite(bounded.low) & np.isfinite(bounded.high)
+    a, b = np.where(finite, bounded.low, 0.0), np.where(finite, bounded.high, 0.0)
     centre = a / 2 + b / 2
     radius = np.nextafter(np.maximum(b - centre, centre - a), np.inf)
-    norms = sum(np.linalg.norm(part, 2, axis=(-2, -1)) for part in (centre, radius)) * (1 + NORM_ROUNDING)
+    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius)) * (1 + NORM_ROUNDING)
     return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
 
 

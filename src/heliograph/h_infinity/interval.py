@@ -51,7 +51,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
             results = evaluate(inner, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:
             results = [_square(inputs[0])]
-        elif name in MOVES or all(part.low.dtype.kind in "iu" for part in inputs):  # whole numbers are not rounded
+        elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
             results = _moved(equation, inputs)
         else:
             results = [_operation(equation, inputs, continuous)]
@@ -100,8 +100,8 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decided(_compare(name, *x), continuous)
         case "sign":
-            result = Interval(np.sign(x[0].low), np.sign(x[0].high))
-            return _decided(result, continuous)
+            sign = Interval(np.sign(x[0].low), np.sign(x[0].high))
+            return _decided(sign, continuous)
         case "and" | "or":
             combine = np.logical_and if name == "and" else np.logical_or
             return Interval(combine(x[0].low, x[1].low), combine(x[0].high, x[1].high))
@@ -121,15 +121,15 @@ def _decided(interval: Interval, continuous: bool) -> Interval:
 
 def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
     """Intervals of numbers that only change places: move the low ends, and the high ends; places are whole numbers."""
-    if any(part.low.dtype.kind in "iu" and not np.array_equal(part.low, part.high) for part in x):
+    if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise UnknownError("a place that depends on x")
-    pairs = zip(_bound(equation, [part.low for part in x]), _bound(equation, [part.high for part in x]), strict=True)
+    pairs = zip(_bound(equation, [a.low for a in x]), _bound(equation, [a.high for a in x]), strict=True)
     return [Interval(*pair) for pair in pairs]
 
 
 def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
-    result = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
-    return list(map(np.asarray, result if equation.primitive.multiple_results else [result]))
+    outputs = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
+    return list(map(np.asarray, outputs if equation.primitive.multiple_results else [outputs]))
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
@@ -175,8 +175,8 @@ def _quotient(a: Interval, b: Interval) -> Interval:
 
 def _square(a: Interval) -> Interval:
     low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
-    result = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
-    return Interval(np.maximum(result.low, 0.0), result.high)
+    square = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
+    return Interval(np.maximum(square.low, 0.0), square.high)
 
 
 def _power(a: Interval, exponent: int) -> Interval:
@@ -199,8 +199,8 @@ def _rising(
     """Interval version of a function that never falls, whose values stay between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
-        result = outward(function(a.low), function(a.high), ULPS)
-        return Interval(np.maximum(result.low, low), np.minimum(result.high, high))
+        values = outward(function(a.low), function(a.high), ULPS)
+        return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
     return call
 
@@ -208,12 +208,12 @@ def _rising(
 def _cosine(a: Interval) -> Interval:
     """Interval of cos: 1 if an even multiple of pi is inside or a hair outside, -1 if an odd one is."""
     ends = np.cos(a.low), np.cos(a.high)
-    result = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
+    cosine = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
     top = np.floor(last / 2) >= np.ceil(first / 2)
     bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
     wild = ~(np.isfinite(a.low) & np.isfinite(a.high))
-    low, high = np.where(bottom | wild, -1.0, result.low), np.where(top | wild, 1.0, result.high)
+    low, high = np.where(bottom | wild, -1.0, cosine.low), np.where(top | wild, 1.0, cosine.high)
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 

@@ -101,8 +101,8 @@ class StepProblem:
         forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
-        for part in independent_parts(step, forms, start):
-            constraints.append(phi[part][:, part] << -MARGIN * np.eye(len(part)))
+        for coupled in independent_parts(step, forms, start):
+            constraints.append(phi[coupled][:, coupled] << -MARGIN * np.eye(len(coupled)))
         for form in forms.positive:
             k = int(np.sqrt(len(form)))
             constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
@@ -120,14 +120,14 @@ class StepProblem:
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
         # later objectives, held near the first one's best value
-        result, best = np.asarray(self.unknowns.value), float(first.value)
+        values, best = np.asarray(self.unknowns.value), float(first.value)
         for problem in others:  # next to no room is left to them, which a solver may find too narrow
             for tie in TIES:
                 self.reached.value = (1 - tie) * best
                 if run_solver(problem, self.solver) == "optimal":
-                    result = np.asarray(self.unknowns.value)
+                    values = np.asarray(self.unknowns.value)
                     break
-        return status, self.layout.unpack(result)
+        return status, self.layout.unpack(values)
 
 
 def _goals(
@@ -211,14 +211,14 @@ class HorizonProblem:
         # -Phi = level^2 energy - target + weight before - next energy, part by part
         constant = -step.target
         constant[:width, :width] += fixed
-        for part in independent_parts(step, forms, start):
-            entries = (part[:, None] * q + part).ravel()
+        for coupled in independent_parts(step, forms, start):
+            entries = (coupled[:, None] * q + coupled).ravel()
             blocks = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
-            for place, form in present.items():
+            for index, form in present.items():
                 before = np.zeros((q, q, form.shape[1]))
                 before[:width, :width] = form.reshape(width, width, -1)
-                blocks[place] = blocks.get(place, 0.0) + before.reshape(q * q, -1)[entries]
-            self._require(blocks, constant[np.ix_(part, part)])
+                blocks[index] = blocks.get(index, 0.0) + before.reshape(q * q, -1)[entries]
+            self._require(blocks, constant[np.ix_(coupled, coupled)])
         # positive matrices of the unknowns
         for form in forms.positive:
             size = int(np.sqrt(len(form)))
@@ -226,7 +226,7 @@ class HorizonProblem:
 
     def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
         """Require sum_i blocks_i (unknowns in place i) + constant to be positive semidefinite."""
-        results = [(block, *np.nonzero(block), self.places[place].start) for place, block in blocks.items()]
+        results = [(block, *np.nonzero(block), self.places[index].start) for index, block in blocks.items()]
         values = np.concatenate([block[rows, columns] for block, rows, columns, _ in results])
         rows = np.concatenate([rows for _, rows, _, _ in results])
         columns = np.concatenate([columns + start for _, _, columns, start in results])

@@ -61,9 +61,9 @@ def all_multipliers(
     """Multipliers with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
     items = 2 if separate else 1
     present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(items)]
-    result = np.zeros((*given.shape[:-1], len(present)))
-    result[..., present] = given
-    return result
+    full = np.zeros((*given.shape[:-1], len(present)))
+    full[..., present] = given
+    return full
 
 
 def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
@@ -92,7 +92,7 @@ def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"],
     energy[v, v], energy[rho, rho] = np.eye(v.stop - v.start), np.eye(rho.stop - rho.start)
     parts = [[(f, x, system.growth.state[k]), (df, e, system.growth.error[k])]] if w else []
     parts += [[(g, x, system.output_growth.state[k]), (dg, e, system.output_growth.error[k])]] if h else []
-    groups = [[part] for pair in parts for part in pair] if separate else parts
+    groups = [[term] for pair in parts for term in pair] if separate else parts
     growth = np.array([_growth(q, group) for group in groups]).reshape(-1, q)
     return StepMatrices(state, error, received, varied, target, energy, growth, np.zeros((n, system.received)))
 
@@ -111,11 +111,11 @@ def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q 
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
-    result = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
+    form = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
     shifted = step.nominal.T @ Y
     whole = Z + shifted + shifted.T + step.nominal.T @ p2 @ step.nominal  # K'P2 K, as Z is that of K - K0
-    result += np.einsum("jai,ab,jbk->ik", step.spreads, whole, step.spreads)
-    return np.asarray(result + np.diag(multipliers @ step.growth))
+    form += np.einsum("jai,ab,jbk->ik", step.spreads, whole, step.spreads)
+    return np.asarray(form + np.diag(multipliers @ step.growth))
 
 
 class Layout(NamedTuple):
@@ -150,10 +150,10 @@ class Layout(NamedTuple):
 
 
 def _symmetric(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
-    result = np.zeros((n, n))
+    matrix = np.zeros((n, n))
     rows, columns = _triangle(n)
-    result[rows, columns] = result[columns, rows] = entries
-    return result
+    matrix[rows, columns] = matrix[columns, rows] = entries
+    return matrix
 
 
 @cache
@@ -290,9 +290,7 @@ def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"
     """Scales diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor(x), _factor(e)))
-    return np.diag(
-        np.concatenate([_nonzero(np.full(len(part), np.sqrt(np.trace(part) / len(part)))) for part in (x, e)])
-    )
+    return np.diag(np.concatenate([_nonzero(np.full(len(s), np.sqrt(np.trace(s) / len(s)))) for s in (x, e)]))
 
 
 def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -312,15 +310,15 @@ def _nonzero(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 def _signals(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
     n, y, q = system.states, system.output.shape[1], len(step.energy)
-    result, at = np.zeros((q, q)), 2 * n
-    result[:n, :n], result[n:at, n:at] = x, e
+    total, at = np.zeros((q, q)), 2 * n
+    total[:n, :n], total[n:at, n:at] = x, e
     for growth, width in ((system.growth, n), (system.output_growth, y)):
         if not growth.absent:
-            for constant, part in ((growth.state[k], x), (growth.error[k], e)):
-                result[at : at + width, at : at + width] = constant**2 * np.linalg.eigvalsh(part)[-1] * np.eye(width)
+            for constant, p in ((growth.state[k], x), (growth.error[k], e)):
+                total[at : at + width, at : at + width] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
                 at += width
-    result[at:, at:] = np.eye(q - at)
-    return result
+    total[at:, at:] = np.eye(q - at)
+    return total
 
 
 def _moved(

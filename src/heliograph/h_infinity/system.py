@@ -97,10 +97,10 @@ def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
 @disturbed_gain.register
 def _(channel: Mixture) -> DisturbedGain:
     parts = [disturbed_gain(affine) for affine in channel.maps]
-    widened = [_place(part, channel.inputs, parts, i) for i, part in enumerate(parts)]
+    widened = [_place(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
     weights = np.asarray(channel.choice.probabilities)
-    mean = np.tensordot(weights, [part.mean for part in widened], axes=1)
-    second = np.tensordot(weights, [part.second for part in widened], axes=1)
+    mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
+    second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
     return DisturbedGain(mean, second, channel.inputs)
 
 
@@ -113,27 +113,27 @@ def _known(matrix: np.ndarray) -> DisturbedGain:
     return DisturbedGain(matrix, np.multiply.outer(matrix, matrix), 0)
 
 
-def _place(part: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
+def _place(gain: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
     """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
     private_widths = [p.mean.shape[1] - shared for p in parts]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
-    m, total = part.mean.shape[0], shared + sum(private_widths)
+    m, total = gain.mean.shape[0], shared + sum(private_widths)
     mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
-    mean[:, columns] = part.mean
-    second[np.ix_(range(m), columns, range(m), columns)] = part.second
+    mean[:, columns] = gain.mean
+    second[np.ix_(range(m), columns, range(m), columns)] = gain.second
     return DisturbedGain(mean, second, shared)
 
 
 def _stack(parts: list[DisturbedGain], shared: int) -> DisturbedGain:
     """Independent maps one above the other that share their first `shared` inputs; E[H_ab H_ij] factors across maps."""
-    placed = [_place(part, shared, parts, i) for i, part in enumerate(parts)]
-    mean = np.concatenate([part.mean for part in placed])
+    placed = [_place(gain, shared, parts, i) for i, gain in enumerate(parts)]
+    mean = np.concatenate([gain.mean for gain in placed])
     second = np.multiply.outer(mean, mean)
     row = 0
-    for part in placed:
-        rows = slice(row, row + part.mean.shape[0])
-        second[rows, :, rows, :] = part.second
+    for gain in placed:
+        rows = slice(row, row + gain.mean.shape[0])
+        second[rows, :, rows, :] = gain.second
         row = rows.stop
     return DisturbedGain(mean, second, shared)
 
@@ -261,8 +261,8 @@ def growth_system(
 def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) -> Float[np.ndarray, "steps ..."]:
     """Matrix of every step, (steps, *shape)."""
     if not isinstance(value, OverTime):
-        item: np.ndarray = array(name, value, shape)
-        return np.broadcast_to(item, (steps, *item.shape))
+        matrix: np.ndarray = array(name, value, shape)
+        return np.broadcast_to(matrix, (steps, *matrix.shape))
     if value.steps < steps:
         raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
     matrices: np.ndarray = array(name, value.values, (None, *shape))
@@ -290,23 +290,23 @@ def _growth(steps: int, name: str, value: Constants) -> Growth:
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
-    constants = [_over(steps, name, part, ()) for part in pair]
-    for part in constants:
-        if np.any(part < 0):
-            raise fail(name, "no negative constant", float(part.min()))
+    constants = [_over(steps, name, constant, ()) for constant in pair]
+    for constant in constants:
+        if np.any(constant < 0):
+            raise fail(name, "no negative constant", float(constant.min()))
     return Growth(*constants)
 
 
 def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     name, size = "initial weight", 2 * n
     single = rank(name, value) == 0
-    result: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
-    unit = float(np.max(np.abs(result), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
-    symmetric = symmetric_weight("initial weight", result / unit)
+    matrix: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
+    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
+    symmetric = symmetric_weight("initial weight", matrix / unit)
     if smallest_eigenvalue(symmetric) <= 0:
         smallest = smallest_eigenvalue(symmetric) * unit
         raise fail("initial weight", "a positive definite matrix", f"smallest eigenvalue {smallest:.3g}")
-    return result
+    return matrix
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:

@@ -139,9 +139,9 @@ class Asking:
             name = mark.given or _new(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
-            item = Parameter(name, mark.start, domain)
+            parameter = Parameter(name, mark.start, domain)
             to_line(name, domain, mark.start)
-            results.append(item)
+            results.append(parameter)
         return Parameters(tuple(results))
 
 
@@ -150,7 +150,7 @@ class Given:
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
         self.values = values
-        self.unnamed = iter([item.name for item, single in zip(parameters.every, named, strict=True) if not single])
+        self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value."""
@@ -200,7 +200,7 @@ class Description:
     @cached_property
     def start(self) -> Network:
         """Network with every free number at its start."""
-        return self.at({item.name: plain_number(item.start) for item in self.parameters.every})
+        return self.at({parameter.name: plain_number(parameter.start) for parameter in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
         """Network at a point (p,) of the line, of plain numbers."""

@@ -107,10 +107,10 @@ class Fit:
         best = self.best
         inner, _ = best.covariance()
         turned = self.description.parameters.jacobian(best.x)[:, best.active]
-        result = turned @ inner @ turned.T
+        rotated = turned @ inner @ turned.T
         lost = np.array([row.boundary or not row.identified for row in best.rows()])
-        result[lost] = result[:, lost] = np.nan
-        return np.asarray(result)
+        rotated[lost] = rotated[:, lost] = np.nan
+        return np.asarray(rotated)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -154,12 +154,13 @@ def fit(
         network: a function that returns a Network in which numbers are marked by `hg.free`.
         recording: what `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the
             one node alone; a `Recording`; a `Record` with all its runs; an `EventTable`; or a list of these.
-        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ.
-        starts: number of starts: the given one, and others drawn around it.
-        seed: seed of the starts that are drawn.
-        progress: called with a line of text at each step.
-        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True
-            takes those that the recordings hold.
+        inputs: inputs of the plant (steps, inputs), or a list of one array for each recording if they differ (default
+            none).
+        starts: number of starts: the given one, and others drawn around it (default 6).
+        seed: seed of the starts that are drawn (default 0).
+        progress: called with a line of text at each step (default none).
+        truth: true states (steps, n), NaN where one is not known, or a list of one array for each recording; True takes
+            those that the recordings hold (default False).
 
     Raises:
         ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit
@@ -196,15 +197,15 @@ def fit(
 def _rows_and_delays(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Rows of tables of events, and the laws of their delays by node; other recordings are rows."""
     several = recording if isinstance(recording, list) else [recording]
-    tables = [item for item in several if hasattr(item, "lateness")]
+    tables = [table for table in several if hasattr(table, "lateness")]
     if not tables:
         return recording, {}
     # Of several tables the measurements of a node are counted together, in steps of the first that has any.
     steps = {name: law.step for table in reversed(tables) for name, law in table.delays().items()}
     late = [table.lateness() for table in tables]
-    delays = {name: learn_delays(np.concatenate([part[name] for part in late if name in part]), step)
+    delays = {name: learn_delays(np.concatenate([lateness[name] for lateness in late if name in lateness]), step)
               for name, step in steps.items()}  # fmt: skip
-    return [item.recording() if item in tables else item for item in several], delays
+    return [table.recording() if table in tables else table for table in several], delays
 
 
 def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
@@ -221,12 +222,12 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
     # spread: 1.5 of a logarithm or logit, half the size of an unbounded number
-    local = np.diag(first.information[0])
+    information = np.diag(first.information[0])
     spread = np.full(len(start), SPREAD)
     for entry in parameters.entries:
-        if entry.place is not None and np.isinf([entry.domain.low, entry.domain.high]).all():
-            at = abs(start[entry.place])
-            spread[entry.place] = at / 2 if at else 3 / np.sqrt(max(local[entry.place], 1e-300))
+        if entry.coordinate is not None and np.isinf([entry.domain.low, entry.domain.high]).all():
+            at = abs(start[entry.coordinate])
+            spread[entry.coordinate] = at / 2 if at else 3 / np.sqrt(max(information[entry.coordinate], 1e-300))
     points: np.ndarray = start + np.concatenate(
         [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
     )
@@ -236,13 +237,13 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
         if not wrong.any():
             break
         points[wrong] = (points[wrong] + start) / 2
-    _check_dependence(surface, points, local)
+    _check_dependence(surface, points, information)
     return points
 
 
-def _check_dependence(surface: Surface, points: np.ndarray, local: np.ndarray) -> None:
+def _check_dependence(surface: Surface, points: np.ndarray, information: np.ndarray) -> None:
     """Check that the likelihood depends on every free number somewhere."""
-    if np.all(local > 0):
+    if np.all(information > 0):
         return
     seen = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
@@ -270,12 +271,12 @@ def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: P
     x, total, active = maximum.x[lane].copy(), float(maximum.total[lane]), np.ones(maximum.x.shape[1], dtype=bool)
     converged, steps = bool(maximum.converged[lane]), maximum.steps
     # a number that the data hardly see goes to its limit if the likelihood does not fall
-    for place in _invisible(surface, x):
+    for index in _invisible(surface, x):
         moved = x.copy()
-        moved[place] = np.inf if x[place] > 0 and _two_sided(surface, place) else -np.inf
+        moved[index] = np.inf if x[index] > 0 and _two_sided(surface, index) else -np.inf
         at_limit = surface.evaluations(moved[None])
         if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
-            x, active[place] = moved, False
+            x, active[index] = moved, False
     # climb again in the other numbers
     if not active.all():
         say(f"{surface.objective.form}: again without {int((~active).sum())} at a limit")
@@ -289,19 +290,19 @@ def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: P
 
 def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
     """List the coordinates of bounded numbers whose information is too small to tell them from the limit."""
-    local = np.diag(surface.evaluations(x[None]).information[0])
+    information = np.diag(surface.evaluations(x[None]).information[0])
     entries = surface.objective.description.parameters.entries
     return [
-        entry.place
+        entry.coordinate
         for entry in entries
-        if entry.place is not None
+        if entry.coordinate is not None
         and np.isfinite([entry.domain.low, entry.domain.high]).any()
-        and local[entry.place] < INVISIBLE
+        and information[entry.coordinate] < INVISIBLE
     ]
 
 
-def _two_sided(surface: Surface, place: int) -> bool:
-    entry = next(e for e in surface.objective.description.parameters.entries if e.place == place)
+def _two_sided(surface: Surface, coordinate: int) -> bool:
+    entry = next(e for e in surface.objective.description.parameters.entries if e.coordinate == coordinate)
     return bool(np.isfinite([entry.domain.low, entry.domain.high]).all())
 
 

@@ -95,7 +95,7 @@ def changes(
         for key, old in before.nodes[name].filters.items():
             if old.claim == "none" or not old.received:
                 continue
-            single, other = (_expected(item, z, inputs, cut) for item in (old, after.nodes[name].filters[key]))
+            single, other = (_expected(filter, z, inputs, cut) for filter in (old, after.nodes[name].filters[key]))
             received = ~np.all(np.isnan(single.white), axis=1)
             gain = (
                 compared((other.log_likelihood - single.log_likelihood)[received]) if received.sum() >= LAGS else None
@@ -108,20 +108,20 @@ def uniformity(
     network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
     """Probability integral transforms of each node: by its laws where known, else by its first filter's Gaussians."""
-    result = []
+    uniform = []
     for name, z in measurements.items():
-        local, node = [change for change in outcome if change.node == name], network.nodes[name]
+        of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
         by_law = _by_law(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
-            result.append(Uniformity(name, by_law[cut:], True))
-        elif local:
-            result.append(Uniformity(name, np.asarray(ndtr(local[0].after.white)), False))
-    return result
+            uniform.append(Uniformity(name, by_law[cut:], True))
+        elif of_node:
+            uniform.append(Uniformity(name, np.asarray(ndtr(of_node[0].after.white)), False))
+    return uniform
 
 
 def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
     parts = (network.plant, node.sensor, node.channel)
-    if any(isinstance(part, OverTime) for part in parts) or first(node.channel).remembers:
+    if any(isinstance(model, OverTime) for model in parts) or first(node.channel).remembers:
         return None
     try:
         return predictive(network.plant, node.sensor, first(node.channel), z, inputs).pit
@@ -130,7 +130,7 @@ def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> 
 
 
 def _expected(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    likelihood, white = (np.asarray(part)[cut:] for part in innovations_of(filter, z, u))
+    likelihood, white = (np.asarray(values)[cut:] for values in innovations_of(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
@@ -149,8 +149,8 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
         ValueError: different recordings, or fewer than 10 steps with a measurement.
     Source: Vuong (1989); Newey and West (1987) for the standard error.
     """
-    for name, item in (("first law", a), ("second law", b)):
-        instance(name, item, Predictive, "what `predictive` gives")
+    for name, law in (("first law", a), ("second law", b)):
+        instance(name, law, Predictive, "what `predictive` gives")
     if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
         raise fail("second law", "the same recording as the first", "another")
     received = ~np.all(np.isnan(a.pit), axis=1)

@@ -51,7 +51,7 @@ class Identifiability:
     @property
     def identified(self) -> tuple[str, ...]:
         """Coordinates that the data identify without knowledge of the others."""
-        lost = {place for group in self.groups for place in group.places}
+        lost = {index for group in self.groups for index in group.places}
         return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
 
     def at(self, solution: "Solution") -> "Identifiability":
@@ -71,9 +71,9 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 
     Args:
         network: a function that returns a Network in which numbers are marked by `hg.free`.
-        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs.
+        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs (default none).
         horizon: number of steps of the data, where there are no inputs; 400 by default.
-        seed: seed of the data and of the points.
+        seed: seed of the data and of the points (default 0).
 
     Raises:
         ValueError: as `fit`.
@@ -115,8 +115,8 @@ def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Ra
     groups = tuple(confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
-    result = Identifiability(parameters, groups, ridges, weakest, ())
-    return replace(result, sentences=sentences(result, None))
+    identifiability = Identifiability(parameters, groups, ridges, weakest, ())
+    return replace(identifiability, sentences=sentences(identifiability, None))
 
 
 def sentences(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
@@ -168,10 +168,10 @@ def _interval(
         return ""
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
-    for entry, item, number in zip(parameters.entries, jacobian, values, strict=True):
-        if entry.place in group.places:
-            weight = row[group.places.index(entry.place)]
-            slopes += weight * (item / number if log else item)
+    for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
+        if entry.coordinate in group.places:
+            weight = row[group.places.index(entry.coordinate)]
+            slopes += weight * (slope / number if log else slope)
             value += weight * (np.log(abs(number)) if log else number)
     covariance, freedom = solution.covariance()
     along = slopes[solution.active]
@@ -192,20 +192,20 @@ def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Flo
 
 @quickly_compiled
 def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
-    item = objective.filter(jnp.asarray(x))
+    filter = objective.filter(jnp.asarray(x))
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         k, u_k, noise = row
-        prior = item.predict(state, u_k, k)
-        received = item.correct(prior, jnp.zeros(item.received), k)[1]
+        prior = filter.predict(state, u_k, k)
+        received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
         columns, _ = factor(jnp.asarray(received.covariance))
         z = jnp.stack(columns, axis=1) @ noise - received.value
-        return item.correct(prior, z, k)[0], z
+        return filter.correct(prior, z, k)[0], z
 
-    start = jax.tree.map(jnp.asarray, item.init())
-    noise = jax.random.normal(key, (len(u), item.received), dtype=float)
-    result: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
-    return result
+    start = jax.tree.map(jnp.asarray, filter.init())
+    noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
+    measurements: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    return measurements
 
 
 if TYPE_CHECKING:
@@ -224,10 +224,10 @@ def route_sentences(solution: "Solution") -> list[str]:
     # mean gain, gain variance, and M R M' + spread of the constant part, of each output
     def totals(x: Array) -> jax.Array:
         world = joint_world(description.at(description.parameters.values(x)))
-        local, link = first(world[1]), first(world[2])
-        result, r = second_order(link), jnp.asarray(local.noise.covariance)
-        mean, p = jnp.asarray(result.mean_gain), result.mean_gain.shape[1]
-        spread = jnp.asarray(result.nominal.center)
+        sensor_now, link = first(world[1]), first(world[2])
+        moments, r = second_order(link), jnp.asarray(sensor_now.noise.covariance)
+        mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
+        spread = jnp.asarray(moments.nominal.center)
         whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
         noise = jnp.diagonal(congruence(mean, r) + contract(spread, whole))
         reached = jnp.argmax(jnp.abs(mean), axis=1)

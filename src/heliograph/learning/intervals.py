@@ -75,15 +75,15 @@ def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draw
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
     rng = np.random.default_rng(seed)
-    result = np.zeros((draws, scores[0].shape[1]))
+    total = np.zeros((draws, scores[0].shape[1]))
     for s in scores:
         length = min(max(int(np.ceil(2 * len(s) ** (1 / 3))), 1), len(s))
         running = np.concatenate([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
-        sums = running[length:] - running[:-length]  # of each block
+        of_blocks = running[length:] - running[:-length]  # of each block
         count = len(s) / length
-        drawn = sums[rng.integers(0, len(sums), (draws, max(int(count), 1)))].sum(axis=1)
-        result += (drawn - max(int(count), 1) * sums.mean(axis=0)) * np.sqrt(count / max(int(count), 1))
-    return result
+        drawn = of_blocks[rng.integers(0, len(of_blocks), (draws, max(int(count), 1)))].sum(axis=1)
+        total += (drawn - max(int(count), 1) * of_blocks.mean(axis=0)) * np.sqrt(count / max(int(count), 1))
+    return total
 
 
 def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:

@@ -70,7 +70,7 @@ class Entry(NamedTuple):
 
     name: str
     domain: Domain
-    place: int | None
+    coordinate: int | None
 
 
 @readable
@@ -87,39 +87,39 @@ class Parameters:
     @property
     def size(self) -> int:
         """Count of numbers on the line."""
-        return sum(item.size for item in self.every)
+        return sum(parameter.size for parameter in self.every)
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
         """The starts on the line."""
-        return np.concatenate([to_line(item.name, item.domain, item.start) for item in self.every])
+        return np.concatenate([to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every])
 
     @property
     def entries(self) -> tuple[Entry, ...]:
         """Rows of the table."""
         results, begin = [], 0
-        for item in self.every:
-            local = item.domain.kind == "interval"
-            for i, (name, domain) in enumerate(zip(item.entries, item.entry_domains, strict=True)):
-                results.append(Entry(name, domain, begin + i if local else None))
-            begin += item.size
+        for parameter in self.every:
+            on_line = parameter.domain.kind == "interval"
+            for i, (name, domain) in enumerate(zip(parameter.entries, parameter.entry_domains, strict=True)):
+                results.append(Entry(name, domain, begin + i if on_line else None))
+            begin += parameter.size
         return tuple(results)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
         """Names of the numbers on the line."""
         return tuple(
-            item.entries[i] if item.domain.kind == "interval" else f"{item.name}({i})"
-            for item in self.every
-            for i in range(item.size)
+            parameter.entries[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
+            for parameter in self.every
+            for i in range(parameter.size)
         )
 
     def values(self, x: Array) -> dict[str, Array]:
         """Numbers at a point of the line, by name."""
-        ends = np.cumsum([0, *(item.size for item in self.every)])
+        ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
-            item.name: from_line(item.domain, item.start.shape, x[a:b])
-            for item, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
+            parameter.name: from_line(parameter.domain, parameter.start.shape, x[a:b])
+            for parameter, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
@@ -129,14 +129,14 @@ class Parameters:
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Values of the entries."""
-        return np.concatenate([item.values(single) for item, single in self._parts(x)])
+        return np.concatenate([parameter.values(single) for parameter, single in self._parts(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
         """Derivatives of the entries."""
-        return np.asarray(block_diag(*(item.derivatives(single) for item, single in self._parts(x))))
+        return np.asarray(block_diag(*(parameter.derivatives(single) for parameter, single in self._parts(x))))
 
     def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
-        ends = np.cumsum([item.size for item in self.every])
+        ends = np.cumsum([parameter.size for parameter in self.every])
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:

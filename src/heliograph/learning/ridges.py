@@ -45,9 +45,9 @@ class Rank(NamedTuple):
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
     """Rank of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
-    local = np.diag(information)
-    there = local > 0
-    unit = np.where(there, 1 / np.sqrt(np.where(there, local, 1.0)), 1.0)
+    diagonal = np.diag(information)
+    there = diagonal > 0
+    unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
     none = values < NOTHING
     least = int(np.argmax(~none)) if (~none).any() else 0
@@ -66,20 +66,20 @@ def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ra
         _basis(log[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (_, log) in zip(used, scales, strict=True)
     ]
     plain = [
-        _basis(item[:, None] * rank.unit[:, None] * rank.flat)
-        for (_, rank), (item, _) in zip(used, scales, strict=True)
+        _basis(slopes[:, None] * rank.unit[:, None] * rank.flat)
+        for (_, rank), (slopes, _) in zip(used, scales, strict=True)
     ]
     return [_in_words(group, logs, plain) for group in _groups(logs)]
 
 
 def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives dv/dx and d log|v|/dx of each coordinate that is a number itself; 1 for the others."""
-    local, log = np.ones(len(x)), np.ones(len(x))
+    slopes, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
-        if entry.place is not None:
-            local[entry.place] = row[entry.place]
-            log[entry.place] = row[entry.place] / value if value else np.nan
-    return local, np.nan_to_num(log)
+        if entry.coordinate is not None:
+            slopes[entry.coordinate] = row[entry.coordinate]
+            log[entry.coordinate] = row[entry.coordinate] / value if value else np.nan
+    return slopes, np.nan_to_num(log)
 
 
 def _basis(vectors: np.ndarray) -> np.ndarray:
@@ -123,25 +123,25 @@ def _everywhere_known(bases: list[np.ndarray]) -> np.ndarray:
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
     """Row echelon form, leading entries 1."""
-    result, lead, pivot = rows.copy(), 0, 0
-    for row in range(len(result)):
+    reduced, lead, pivot = rows.copy(), 0, 0
+    for row in range(len(reduced)):
         # pivot: the largest entry of the next column that has one
-        while lead < result.shape[1]:
-            pivot = row + int(np.argmax(np.abs(result[row:, lead])))
-            if abs(result[pivot, lead]) > SAME:
+        while lead < reduced.shape[1]:
+            pivot = row + int(np.argmax(np.abs(reduced[row:, lead])))
+            if abs(reduced[pivot, lead]) > SAME:
                 break
             lead += 1
-        if lead == result.shape[1]:
+        if lead == reduced.shape[1]:
             break
         # swap, scale, eliminate
-        result[[row, pivot]] = result[[pivot, row]]
-        result[row] /= result[row, lead]
-        for other in range(len(result)):
+        reduced[[row, pivot]] = reduced[[pivot, row]]
+        reduced[row] /= reduced[row, lead]
+        for other in range(len(reduced)):
             if other != row:
-                result[other] -= result[other, lead] * result[row]
+                reduced[other] -= reduced[other, lead] * reduced[row]
         lead += 1
-    result[np.abs(result) < SAME] = 0.0
-    return result
+    reduced[np.abs(reduced) < SAME] = 0.0
+    return reduced
 
 
 def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:

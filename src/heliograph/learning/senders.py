@@ -104,7 +104,7 @@ def fit_sender(
     parameters = description.parameters
     if len(description.start.names) != 1:
         raise fail("network whose sender decides", "one node, to be learned", list(description.start.names))
-    if any(entry.place is None for entry in parameters.entries):
+    if any(entry.coordinate is None for entry in parameters.entries):
         raise fail(
             "free numbers of a sender that decides", "numbers with limits of their own", "a simplex or covariance"
         )
@@ -112,9 +112,9 @@ def fit_sender(
     data = gathered(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        item = filter_at(description.at_point(x))
+        filter = filter_at(description.at_point(x))
         rows = zip(data.measurements, data.inputs, data.lengths, strict=True)
-        total = sum(float(log_likelihood(item, z[:n], u[:n])) for z, u, n in rows)
+        total = sum(float(log_likelihood(filter, z[:n], u[:n])) for z, u, n in rows)
         return total if np.isfinite(total) else -1e300
 
     # The best of several starts, and the profile of each number.
@@ -141,36 +141,36 @@ def _highest(likelihood: Likelihood, start: Float[np.ndarray, " p"]) -> tuple[Fl
     simplex = start + 0.2 * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     options: Any = {"initial_simplex": simplex, "xatol": DIGITS, "fatol": 1e-3, "maxfev": 200 * len(start)}
     climb: Any = minimize  # its types do not know an initial simplex
-    result = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options)
-    return np.asarray(result.x), -float(result.fun), bool(result.success)
+    optimum = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options)
+    return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
 def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, " p"], total: float, index: int) -> Row:
     """The estimate, and how far the profile stays near its maximum to either side."""
     entry = description.parameters.entries[index]
-    place = index if entry.place is None else entry.place
+    coordinate = index if entry.coordinate is None else entry.coordinate
 
     def profile(value: float) -> float:
-        rest = np.delete(x, place)
-        return _highest(lambda other: likelihood(np.insert(other, place, value)), rest)[1]
+        rest = np.delete(x, coordinate)
+        return _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest)[1]
 
     def number(value: float) -> float:
         point = x.copy()
-        point[place] = value
+        point[coordinate] = value
         return float(description.parameters.entries_at(point)[index])
 
     # Doubled steps until the profile is below, then bisection.
     ends = []
     for sign in (-1.0, 1.0):
         inside, outside = 0.0, 0.05
-        while outside < FURTHEST and profile(x[place] + sign * outside) > total - TWO_SIDED:
+        while outside < FURTHEST and profile(x[coordinate] + sign * outside) > total - TWO_SIDED:
             inside, outside = outside, 2 * outside
         for _ in range(HALVINGS):
             middle = (inside + outside) / 2
-            near = profile(x[place] + sign * middle) > total - TWO_SIDED
+            near = profile(x[coordinate] + sign * middle) > total - TWO_SIDED
             inside, outside = (middle, outside) if near else (inside, middle)
             if outside - inside < 1e-3:
                 break
-        ends.append(number(x[place] + sign * outside))
+        ends.append(number(x[coordinate] + sign * outside))
     low, high = sorted(ends)
-    return Row(entry.name, number(x[place]), low, high, (high - low) / (2 * 1.96), "conditional", False, True)
+    return Row(entry.name, number(x[coordinate]), low, high, (high - low) / (2 * 1.96), "conditional", False, True)

@@ -92,9 +92,9 @@ class Solution:
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the identified directions."""
         observed = self.surface.hessian(self.x, self.active)[np.ix_(self.active, self.active)]
-        result = self._reduced(observed)
-        if np.linalg.eigvalsh(result)[:1].sum() > 0:
-            return result
+        reduced = self._reduced(observed)
+        if np.linalg.eigvalsh(reduced)[:1].sum() > 0:
+            return reduced
         information = self.surface.evaluations(self.x[None]).information[0]
         return self._reduced(information[np.ix_(self.active, self.active)])
 
@@ -112,8 +112,8 @@ class Solution:
         if method == "bootstrap":
             drawn = np.linalg.solve(self.hessian, block_sums(scores, DRAWS, 0).T)
             return np.asarray(self.basis @ np.cov(drawn).reshape(len(drawn), -1) @ self.basis.T), np.inf
-        result = long_run(method, scores, self.hessian)
-        return np.asarray(self.basis @ sandwich(self.hessian, result.covariance) @ self.basis.T), result.freedom
+        estimate = long_run(method, scores, self.hessian)
+        return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines") -> tuple[Row, ...]:
         """Table by this form."""
@@ -127,14 +127,14 @@ class Solution:
     def _row(
         self, entry: Entry, value: float, slopes: np.ndarray, covariance: np.ndarray, freedom: float, method: Method
     ) -> Row:
-        if entry.place is not None and not self.active[entry.place]:
+        if entry.coordinate is not None and not self.active[entry.coordinate]:
             return self._at_boundary(entry, value)
         if not self.identifies(slopes):
             return Row(entry.name, value, np.nan, np.nan, np.nan, self.form, False, False)
         error = float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
         center = link(entry.domain, value)
-        if method == "profile" and entry.place is not None:
-            low, high = self._profile(entry.place, error)
+        if method == "profile" and entry.coordinate is not None:
+            low, high = self._profile(entry.coordinate, error)
         elif method == "bootstrap":
             low, high = center + self._drawn(slopes)
         else:
@@ -155,25 +155,25 @@ class Solution:
         ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return ends
 
-    def _profile(self, place: int, error: float) -> tuple[float, float]:
-        here = self.x[place]
+    def _profile(self, coordinate: int, error: float) -> tuple[float, float]:
+        here = self.x[coordinate]
         low, high = (
-            self.surface.crossing(self.x, self.total, place, here + sign * error * REACH, TWO_SIDED, self.active)
+            self.surface.crossing(self.x, self.total, coordinate, here + sign * error * REACH, TWO_SIDED, self.active)
             for sign in (-1.0, 1.0)
         )
         return low, high
 
     def _at_boundary(self, entry: Entry, value: float) -> Row:
         """Row of a number at a limit: from there to where the profile has fallen so far that 95 % are below."""
-        assert entry.place is not None
-        outward = -1.0 if self.x[entry.place] < 0 else 1.0
+        assert entry.coordinate is not None
+        outward = -1.0 if self.x[entry.coordinate] < 0 else 1.0
         points = np.repeat(self.x[None], 33, axis=0)
-        points[:, entry.place] = reach = -outward * np.linspace(-24.0, 8.0, 33)
+        points[:, entry.coordinate] = reach = -outward * np.linspace(-24.0, 8.0, 33)
         totals = self.surface.evaluations(points).total
         fallen = np.flatnonzero(~(totals > self.total - ONE_SIDED))
         last = int(fallen[0]) if len(fallen) else len(reach) - 1
         ends = reach[max(last - 1, 0)] + np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 3.0, 5.0]) * -outward
-        end = self.surface.crossing(self.x, self.total, entry.place, ends, ONE_SIDED, self.active)
+        end = self.surface.crossing(self.x, self.total, entry.coordinate, ends, ONE_SIDED, self.active)
         limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
         return Row(entry.name, value, min(value, limit), max(value, limit), np.nan, self.form, True, True)
 
@@ -186,7 +186,7 @@ def cut(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
     rank = rank_of(late)
     if rank.flat.shape[1] == ridges:
         return rank
-    local = np.diag(late)
-    unit = np.where(local > 0, 1 / np.sqrt(np.where(local > 0, local, 1.0)), 1.0)
+    diagonal = np.diag(late)
+    unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
     _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
     return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)

@@ -61,8 +61,8 @@ def samples_to_tell(
         network: a network of one node that receives its sensor through a channel.
         inputs: inputs of the plant (steps, inputs); their length is that of the runs, 500 steps unless given.
         error: probability of either wrong decision, in (0, 0.5); 0.05 by default.
-        seed: seed of the simulation.
-        nodes: number of values that stand for each law.
+        seed: seed of the simulation (default 0).
+        nodes: number of values that stand for each law (default 64).
 
     Raises:
         ValueError: a network with several nodes or none that receives through a channel, no gain to put the laws in, an
@@ -104,27 +104,27 @@ def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Abstr
     laws = [
         leaf for leaf in jax.tree.leaves(single, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)
     ]
-    of_pair = [leaf for leaf in laws if any(same(leaf, item) for item in pair)]
+    of_pair = [leaf for leaf in laws if any(same(leaf, law) for law in pair)]
     chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
     if not of_pair and not 0 < len(chosen) == len(laws):
         raise fail("network", "gains of one law, or some whose law is one of the two", f"{len(laws)} random gains")
 
     def placed(leaf: object) -> object:
-        return law if any(leaf is item for item in chosen) else leaf
+        return law if any(leaf is gain for gain in chosen) else leaf
 
-    result: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law)
-    return result
+    changed: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law)
+    return changed
 
 
-def _is_law(item: object) -> bool:
-    return isinstance(item, AbstractLaw)
+def _is_law(leaf: object) -> bool:
+    return isinstance(leaf, AbstractLaw)
 
 
 def _ratios(
     network: Network,
     name: str,
     node: Node,
-    local: AbstractRandomAffine,
+    true: AbstractRandomAffine,
     other: AbstractRandomAffine,
     inputs: ArrayLike | None,
     count: int,
@@ -132,15 +132,15 @@ def _ratios(
     nodes: int,
 ) -> np.ndarray:
     """Log-likelihood ratio log p_true - log p_other of each run and step, of data drawn under the first law."""
-    plain = Node(node.sensor, local, {"open_loop": open_loop_filter(network.plant)})
+    plain = Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]
     u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     said = []
-    for channel in (local, other):
+    for channel in (true, other):
         received = arrived(channel)
-        item, parts = cubature_filter(network.plant, node.sensor, received), Parts.of(received, nodes)
-        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(item, z, u))
+        filter, parts = cubature_filter(network.plant, node.sensor, received), Parts.of(received, nodes)
+        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(filter, z, u))
         said.append(of_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])
 

@@ -77,11 +77,11 @@ def steady(system: KnownLossSystem, gains: KindGains, source: Parts) -> Parts:
     if system.forgets:
         right = source.sum(axis=0)
         total = np.linalg.solve(np.eye(n * n) - matrix, right.ravel()).reshape(n, n)
-        result = system.chain[0][:, None, None] * total
+        solution = system.chain[0][:, None, None] * total
     else:
         right = np.einsum("ij,iab->jab", system.chain, source)
-        result = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
-    return np.asarray((result + result.swapaxes(1, 2)) / 2)
+        solution = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
+    return np.asarray((solution + solution.swapaxes(1, 2)) / 2)
 
 
 def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
@@ -155,8 +155,8 @@ def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
 def _fastest(system: KnownLossSystem, values: np.ndarray, vectors: np.ndarray) -> Parts:
     """The covariances that grow by the spectral radius: a positive map has such an eigenvector."""
-    n, result = len(system.transition), np.real(vectors[:, np.argmax(values.real)])
-    parts = result.reshape(-1, n, n)
+    n, eigenvector = len(system.transition), np.real(vectors[:, np.argmax(values.real)])
+    parts = eigenvector.reshape(-1, n, n)
     parts = parts + parts.swapaxes(1, 2)
     parts = parts * np.sign(np.trace(parts.sum(axis=0)))
     parts = parts / np.trace(parts.sum(axis=0)) + np.eye(n) / NEGLIGIBLE
@@ -197,8 +197,8 @@ def lower_bound(system: KnownLossSystem) -> Parts | None:
         matrix, right = np.block(blocks), np.einsum("ij,iab->jab", system.chain, source)
     if spectral_radius(matrix) >= BELOW_ONE:
         return None
-    result = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
-    return np.asarray(system.chain[0][:, None, None] * result if system.forgets else result).reshape(modes, n, n)
+    solution = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
+    return np.asarray(system.chain[0][:, None, None] * solution if system.forgets else solution).reshape(modes, n, n)
 
 
 UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing

@@ -84,8 +84,8 @@ def lifted_modes(
     # Matrices of each distinct measurement and plant once.
     step_matrices, rounding, earlier = [], [], law
     distinct = {id(measurement): measurement for measurement in measurements}
-    of_modes = {place: item.moments(degree) for place, item in distinct.items()}
-    of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
+    of_modes = {identity: measurement.moments(degree) for identity, measurement in distinct.items()}
+    of_plant = {identity: np.asarray(p.moments(degree).matrix) for identity, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
     steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
@@ -111,7 +111,7 @@ def lifted_modes(
         step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
         rounding.append(EPS * np.kron(law, np.diag(after)))
         before, rows = after, np.asarray(measurement.transition)
-    steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*step_matrices, strict=True)))
+    steps = Steps(*(over_horizon(values, len(plants)) for values in zip(*step_matrices, strict=True)))
     return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
 
 
@@ -163,10 +163,10 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     if first(channel).remembers:
         projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
         distinct = {id(r.measurement): r.measurement for r in routes}
-        modes = {place: joint_modes(item, order=degree) for place, item in distinct.items()}
-        items = [modes[id(r.measurement)] for r in routes]
+        modes = {identity: joint_modes(measurement, order=degree) for identity, measurement in distinct.items()}
+        chains = [modes[id(r.measurement)] for r in routes]
         refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
-        return lifted_modes([r.plant for r in routes], items, degree, moments, projection)
+        return lifted_modes([r.plant for r in routes], chains, degree, moments, projection)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
@@ -201,13 +201,13 @@ def _lifted_steps(
         noise, noise_lost = listen.conditional_spread(moments)
         parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
         lost.append((process_lost, noise_lost))
-    steps = Steps(*(over_horizon(part, len(routes)) for part in zip(*parts, strict=True)))
-    process_rounding, received_rounding = (over_horizon(part, len(routes)) for part in zip(*lost, strict=True))
+    steps = Steps(*(over_horizon(values, len(routes)) for values in zip(*parts, strict=True)))
+    process_rounding, received_rounding = (over_horizon(values, len(routes)) for values in zip(*lost, strict=True))
     return steps, process_rounding, received_rounding
 
 
-def _same(item: AbstractRandomAffine, two: AbstractRandomAffine) -> bool:
-    return item is two or bool(eqx.tree_equal(item, two))
+def _same(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
+    return left is right or bool(eqx.tree_equal(left, right))
 
 
 class Lifted:
@@ -223,8 +223,8 @@ class Lifted:
         small = not varies and rows * columns <= STORED_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
-        local = degrees(route.outputs, degree)
-        self.highest = local[:, None] + local
+        produced = degrees(route.outputs, degree)
+        self.highest = produced[:, None] + produced
         if not has_known_gain(route):
             self.highest = np.full_like(self.highest, 2 * degree + 2)
 
@@ -243,7 +243,7 @@ class Lifted:
         what y is worth, far from zero or growing, costs no digits of the noise.
         """
         n, m = self.route.inputs + 1, self.route.outputs + 1
-        result, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
+        spread, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
         for highest in range(2, int(self.highest.max()) + 1):
             here = self.highest == highest
             if not here.any():
@@ -251,9 +251,9 @@ class Lifted:
             low = np.where(self.given <= highest - 2, np.asarray(moments), 0.0)
             after = np.asarray(second_moments(self.push(low), m, self.degree))
             left = after - self.matrix @ np.asarray(second_moments(low, n, self.degree)) @ self.matrix.T
-            result = np.where(here, left, result)
+            spread = np.where(here, left, spread)
             lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
-        return result[:-1, :-1], lost[:-1]
+        return spread[:-1, :-1], lost[:-1]
 
 
 def mean_and_spread(
@@ -307,33 +307,33 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
     sensors = _maps(each_step(sensor, horizon), order)
     channels = each_step(channel, horizon)
     fixed = not isinstance(sensor, OverTime) and not isinstance(channel, OverTime)
-    item = Series([sensors[0], channels[0]])
-    measurements = [item if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
+    route = Series([sensors[0], channels[0]])
+    measurements = [route if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
-def _maps(items: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+def _maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
-    result: list[GainAndNoise] = []
-    before, noise = None, Tabulated(items[0].noise, order)
-    for item in items:
-        if item is before:
-            result.append(result[-1])
+    maps: list[GainAndNoise] = []
+    before, noise = None, Tabulated(models[0].noise, order)
+    for model in models:
+        if model is before:
+            maps.append(maps[-1])
             continue
-        if not eqx.tree_equal(item.noise, noise.source):
-            noise = Tabulated(item.noise, order)
-        result.append(GainAndNoise(Constant(1.0), item.matrix, noise))
-        before = item
-    return result
+        if not eqx.tree_equal(model.noise, noise.source):
+            noise = Tabulated(model.noise, order)
+        maps.append(GainAndNoise(Constant(1.0), model.matrix, noise))
+        before = model
+    return maps
 
 
-def each_step(item: T | OverTime, horizon: int) -> list[T]:
+def each_step(model: T | OverTime, horizon: int) -> list[T]:
     """A plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
-    if not isinstance(item, OverTime):
-        return [item] * horizon
-    check_horizon(horizon, item.steps)
-    return unstack(item)[:horizon]
+    if not isinstance(model, OverTime):
+        return [model] * horizon
+    check_horizon(horizon, model.steps)
+    return unstack(model)[:horizon]
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:

@@ -46,8 +46,8 @@ def modal_system(
         ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
             closed), fewer steps than the horizon.
     """
-    for what, part in (("move", move), ("measure", measure)):
-        as_maps(what, [first(part)])
+    for what, affine in (("move", move), ("measure", measure)):
+        as_maps(what, [first(affine)])
     n = first(move).inputs
     sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
     for name, size in sizes.items():

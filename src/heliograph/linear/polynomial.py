@@ -208,10 +208,10 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
         linear = [x[(i,)] for i in range(states)] + [len(spread) + z[(i,)] for i in range(outputs)]
         deviation = np.sqrt(np.diag(joint))
         for places, start in ((x, 0), (z, len(spread))):
-            for (a, b), place in ((key, p) for key, p in places.items() if len(key) == 2):
+            for (a, b), row in ((key, p) for key, p in places.items() if len(key) == 2):
                 i, j = start + places[(a,)], start + places[(b,)]
                 # k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c).
-                third = joint[start + place, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
+                third = joint[start + row, linear] - mean[i] * joint[j, linear] - mean[j] * joint[i, linear]
                 size = deviation[i] * deviation[j] * deviation[linear]
                 ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
                 worst = max(worst, float(np.max(ratio)))

@@ -39,8 +39,8 @@ def covariance_step(
     total = cross @ s.output.T + s.noise
     gain = pseudo_solve(total, cross).T
     rounded = with_rounding(predicted, len(cross))
-    local = np.diag(s.noise)
-    if np.all(local >= 0) and np.any(local < PRECISE * np.diag(total)):  # P - G C P lost digits
+    variances = np.diag(s.noise)
+    if np.all(variances >= 0) and np.any(variances < PRECISE * np.diag(total)):  # P - G C P lost digits
         keep, units = np.eye(len(gain)) - gain @ s.output, np.diag(rounded - predicted) ** 2
         known = np.diag(units / np.where(units > 0, np.diag(predicted), 1.0))
         after = keep @ predicted @ keep.T + gain @ s.noise @ gain.T + known
@@ -70,6 +70,10 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
 
     `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
     "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
+
+    Args:
+        system: whose state y is estimated from its measurements z.
+        claim: of the schedule (default "exact").
 
     Raises:
         ValueError: an unknown claim.
@@ -102,7 +106,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         error = np.diag(projection @ rounding @ projection.T)
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
-    gains = Gains(*(over_horizon(part, system.horizon) for part in zip(*parts, strict=True)))
+    gains = Gains(*(over_horizon(values, system.horizon) for values in zip(*parts, strict=True)))
     return Schedule(gains, system.mean, _supported(claim, worst, when))
 
 
@@ -143,6 +147,10 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
 
     Joint moments of (y, s) are propagated; nothing is assumed of the gains.
 
+    Args:
+        system: the world.
+        schedule: gains for as many steps and measurements.
+
     Raises:
         ValueError: a system and a schedule of different lengths or measurements.
     """
@@ -155,7 +163,7 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     mean, state = system.mean, schedule.start
     yy, ss = system.covariance, np.zeros((len(state), len(state)))
     ys = np.zeros((len(mean), len(state)))
-    result = []
+    covariances = []
     # Joint moments of system state y, filter state s and measurement z.
     for k in range(system.horizon):
         s, now = system.step(k), Gains(*(field[k] for field in g))
@@ -167,10 +175,10 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         bias = system.projection @ mean - now.output @ state - now.direct @ z - now.output_offset
         joint = np.block([[yy, ys, yz], [ys.T, ss, sz], [yz.T, sz.T, zz]])
         row = np.concatenate([system.projection, -now.output, -now.direct], axis=1)
-        result.append(row @ joint @ row.T + np.outer(bias, bias))
+        covariances.append(row @ joint @ row.T + np.outer(bias, bias))
         # s+ = F s + K z + c.
         state = now.transition @ state + now.gain @ z + now.offset
         cross = now.transition @ sz @ now.gain.T
         ss = now.transition @ ss @ now.transition.T + cross + cross.T + now.gain @ zz @ now.gain.T
         ys = ys @ now.transition.T + yz @ now.gain.T
-    return np.array(result)
+    return np.array(covariances)

@@ -78,22 +78,22 @@ def critical_arrival(
         what = "sensor" if fixed is None else "gain"
         raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
     # Upper bound: bisection over certified gains.
-    upper, result = _smallest(gain_at, lower)
-    return CriticalArrival(lower if fixed is None else upper, upper, result)
+    upper, certified = _smallest(gain_at, lower)
+    return CriticalArrival(lower if fixed is None else upper, upper, certified)
 
 
 def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
     """The smallest arrival with a certified gain, by bisection, and that gain; `lower` itself if it is that close."""
-    near, result = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
+    near, gain = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
     if near is not None:
         return lower, near
     low, high = lower, 1.0
     while high - low > RESOLUTION / 10:
         middle = (low + high) / 2
         candidate = gain_at(middle)
-        low, high, result = (middle, high, result) if candidate is None else (low, middle, candidate)
-    assert result is not None
-    return high, result
+        low, high, gain = (middle, high, gain) if candidate is None else (low, middle, candidate)
+    assert gain is not None
+    return high, gain
 
 
 def plant_matrices(
@@ -121,10 +121,10 @@ def sensor_matrices(
     return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
 
 
-def _kind(item: AnyPlant | AnySensor) -> str:
-    if isinstance(item, OverTime):
+def _kind(model: AnyPlant | AnySensor) -> str:
+    if isinstance(model, OverTime):
         return "one that varies"
-    return f"one that varies with {list(item.inputs)}" if isinstance(item, LinearPlant) else type(item).__name__
+    return f"one that varies with {list(model.inputs)}" if isinstance(model, LinearPlant) else type(model).__name__
 
 
 CLOSE = 1e-8  # relative: what one more step of the Riccati recursion may change

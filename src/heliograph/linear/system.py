@@ -113,8 +113,8 @@ def over_horizon(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
 
 
 def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    result: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
-    return result
+    numbers: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
+    return numbers
 
 
 class StateMoments(NamedTuple):
@@ -128,6 +128,9 @@ def state_moments(system: LinearSystem) -> StateMoments:
     """Propagate the moments of y of a `system` before any data: X+ = A X A' + Cov(w).
 
     No best filter's error exceeds them, P_k <= X_k.
+
+    Args:
+        system: a linear system.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
     mean, spread = system.mean, system.covariance
@@ -237,6 +240,9 @@ def _known(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def load_schedule(path: str | Path) -> Schedule:
     """Read the schedule that `Schedule.save` wrote to the file `path`.
+
+    Args:
+        path: of the file.
 
     Raises:
         ValueError: a file that holds no schedule.

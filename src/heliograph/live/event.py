@@ -35,7 +35,7 @@ class Event(NamedTuple):
 class Known(NamedTuple):
     """An event as numbers, with the index of its node in the network, -1 for inputs."""
 
-    place: int
+    node_index: int
     sequence: int
     time: float
     values: Float[np.ndarray, " size"]
@@ -44,7 +44,7 @@ class Known(NamedTuple):
     @property
     def name(self) -> tuple[int, int, float]:
         """Return the key of the event. It contains the time, since counts start again after a reboot."""
-        return self.place, self.sequence, self.time
+        return self.node_index, self.sequence, self.time
 
 
 def whole(name: str, value: object) -> int:

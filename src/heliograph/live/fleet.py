@@ -103,10 +103,10 @@ class Fleet:
         """Remove a plant and free its slots."""
         self.pool.give([row.slot for row in plant.rows.held])
 
-    def size(self, place: int) -> int:
-        """Return how many numbers an event of the node at this place has."""
-        part = self._places[place]
-        return part.stop - part.start
+    def size(self, node: int) -> int:
+        """Return how many numbers an event of the node with this index has."""
+        columns = self._places[node]
+        return columns.stop - columns.start
 
     def rows(self, base: HeldRow) -> Rows:
         """Return a chain of rows that begins with this one."""
@@ -114,13 +114,13 @@ class Fleet:
 
     def known(self, node: str, sequence: int, time: float, values: list[float | None], arrival: float) -> Known:
         """Convert an event to numbers."""
-        place, size = self.sizes.get(node, (0, -1))
+        index, size = self.sizes.get(node, (0, -1))
         if size < 0:
             raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
         if len(values) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
-        return Known(place, sequence, time, np.array(values, dtype=np.float64), arrival)
+        return Known(index, sequence, time, np.array(values, dtype=np.float64), arrival)
 
     def check_step(self, name: str, time: float) -> None:
         """Refuse a time that is no step of the network, where time counts steps."""
@@ -199,8 +199,8 @@ class Fleet:
 
     def forget(self, finalised: Iterable[Finalised]) -> None:
         """Free the slots of these rows, once their outputs have been read."""
-        for item in finalised:
-            self.pool.give(item.left)
+        for row in finalised:
+            self.pool.give(row.left)
 
 
 def _checked(options: Options) -> Options:
@@ -218,13 +218,13 @@ def _rounds(chains: Iterable[list[HeldRow]], by_steps: bool) -> list[Round]:
     rounds: list[Round] = []
     for chain in chains:
         turn = 0
-        for item, two in pairwise(chain):
-            before, last = item.slot, two.key[0]
-            for at in range(int(item.key[0]) + 1, int(last) + 1) if by_steps else (last,):
+        for row, next_row in pairwise(chain):
+            before, last = row.slot, next_row.key[0]
+            for at in range(int(row.key[0]) + 1, int(last) + 1) if by_steps else (last,):
                 if turn == len(rounds):
                     rounds.append(([], [], []))
                 rounds[turn][0].append(before)
-                rounds[turn][1].append(two.slot)
+                rounds[turn][1].append(next_row.slot)
                 rounds[turn][2].append(at)
-                before, turn = two.slot, turn + 1
+                before, turn = next_row.slot, turn + 1
     return rounds

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.plausibility import Judgement, why_inputs, why_values
 from heliograph.live.event import Known
 from heliograph.live.fleet import Fleet
-from heliograph.live.lanes import Place
+from heliograph.live.lanes import FilterColumns
 from heliograph.live.plant import Plant
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.types import Float
@@ -31,11 +31,11 @@ class Judges:
 
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.lanes.places
-        central = _columns([place for place in places if place.node == FUSED])
+        central = _columns([output for output in places if output.node == FUSED])
         self._columns = {}
-        for place, name in enumerate(fleet.network.names):
-            local = _columns([single for single in places if single.node == name and _listens(fleet, single)])
-            self._columns[place] = local if len(local) else central
+        for index, name in enumerate(fleet.network.names):
+            of_node = _columns([output for output in places if output.node == name and _listens(fleet, output)])
+            self._columns[index] = of_node if len(of_node) else central
         self._every = _columns(places)
 
     def implausible_inputs(
@@ -61,25 +61,25 @@ class Judges:
             return {}
         # Most rows raise no flag: look at the parts of a judgement only where one is raised.
         pool = self.fleet.pool
-        outputs = pool.table[[item.row.slot for item in taken], pool.outputs]
+        outputs = pool.table[[candidate.row.slot for candidate in taken], pool.outputs]
         flagged = (outputs[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
         # Reasons by candidate; by plant the first of its implausible inputs.
-        result, spoilt = dict[int, str](), dict[str, int]()
+        reasons, spoilt = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
-            item = taken[i]
-            if item.event.place >= 0:
-                why = why_values(outputs[i][self._columns[item.event.place]]) if _size(item.event) >= 0 else None
+            event, plant = taken[i].event, taken[i].plant.name
+            if event.node_index >= 0:
+                why = why_values(outputs[i][self._columns[event.node_index]]) if _size(event) >= 0 else None
             elif why := self.why_inputs(outputs[i]):
-                first = spoilt.setdefault(item.plant.name, i)
-                spoilt[item.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
+                first = spoilt.setdefault(plant, i)
+                spoilt[plant] = min(first, i, key=lambda j: taken[j].row.key)
             if why:
-                result[i] = why
+                reasons[i] = why
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
-        for i in result:
-            place = taken[i].row.slot, taken[i].event.place
-            largest[place] = max(largest.get(place, i), i, key=lambda j: _size(taken[j].event))
-        first_of_plant = {i: why for i, why in result.items() if spoilt.get(taken[i].plant.name, i) == i}
+        for i in reasons:
+            node_of_row = taken[i].row.slot, taken[i].event.node_index
+            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j].event))
+        first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i].plant.name, i) == i}
         return {i: why for i, why in first_of_plant.items() if i in largest.values()}
 
 
@@ -88,12 +88,12 @@ def _size(event: Known) -> float:
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
-def _columns(places: Sequence[Place]) -> np.ndarray:
+def _columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
     """Return the columns of the judgements of these filters, of shape (filter, part)."""
-    results = [list(place.judgement) for place in places if place.judgement is not None]
+    results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 
 
-def _listens(fleet: Fleet, place: Place) -> bool:
-    item = fleet.network.nodes[place.node].filters.get(place.filter)  # a fusion between neighbours is none
-    return item is not None and bool(item.received)
+def _listens(fleet: Fleet, output: FilterColumns) -> bool:
+    filter = fleet.network.nodes[output.node].filters.get(output.filter)  # a fusion between neighbours is none
+    return filter is not None and bool(filter.received)

@@ -2,7 +2,6 @@
 
 from functools import cached_property, partial
 from typing import NamedTuple
-from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from heliograph.live.snapshot import Identity, network_identity
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import AbstractPlant
+from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
@@ -60,9 +60,9 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
         for x in (mean, mean + spread):
             for s, t in CUTS:
                 whole, parts = _moved(plant, dt, x, (s + t,)), _moved(plant, dt, x, (s, t))
-                for what, item, two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
-                    gap = float(np.abs(item - two).max())
-                    if not gap <= TOLERANCE * max(1.0, float(np.abs(item).max())):
+                for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
+                    gap = float(np.abs(at_once - in_two).max())
+                    if not gap <= TOLERANCE * max(1.0, float(np.abs(at_once).max())):
                         return (
                             f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}; give the "
                             "plant a function, and a noise, of dt that agree over the parts of an interval"
@@ -76,8 +76,8 @@ def _moved(
     """Return state, Jacobian and noise covariance after these intervals."""
     n = len(x)
     state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
-    for part in parts:
-        u = jnp.ones(len(plant.inputs)).at[dt].set(part)
+    for interval in parts:
+        u = jnp.ones(len(plant.inputs)).at[dt].set(interval)
         a = jax.jacfwd(plant.transition)(state, u)
         state, matrix, spread = (
             plant.transition(state, u) + plant.noise_mean(), a @ matrix, a @ spread @ a.T + plant.noise_covariance(u),
@@ -109,7 +109,7 @@ class TestedAt(NamedTuple):
     arrived: int
 
 
-class Place(NamedTuple):
+class FilterColumns(NamedTuple):
     """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
 
     `judgement` is None for a fusion rule, which receives no measurement; `tested` has its squared innovation by what
@@ -175,16 +175,16 @@ class Lanes:
         """Return the identity of the network and its program, which a saved timeline is compared with."""
         return network_identity(self.network, self.step_rows.program, {})
 
-    def _places(self) -> tuple[Place, ...]:
+    def _places(self) -> tuple[FilterColumns, ...]:
         """Locate each filter's estimate, by reading a row that holds its own column numbers as a row of estimates."""
         outputs = self.step_rows.outputs
-        result = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
-        mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
-        covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
-        judged, weighed = self._judged(result), self._weighed(result)
-        tested = {(FUSED, name): TestedAt(*map(int, item)) for name, item in result["tested"].items()}
+        numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
+        mean = by_name(self.network, numbered, lambda estimate: np.asarray(estimate.mean), -3)
+        covariance = by_name(self.network, numbered, lambda estimate: np.asarray(estimate.covariance), -4)
+        judged, weighed = self._judged(numbered), self._weighed(numbered)
+        tested = {(FUSED, name): TestedAt(*map(int, columns)) for name, columns in numbered["tested"].items()}
         return tuple(
-            Place(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
+            FilterColumns(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
                   judged[node].get(name), weighed.get((node, name)), tested.get((node, name)))
             for node, filters in self.claims.items()
             for name, claim in filters.items()
@@ -193,37 +193,31 @@ class Lanes:
     def _weighed(self, outcome: PyTree) -> dict[tuple[str, str], WeighedAt]:
         """Return the columns of what each filter that weighs made of its components, by node and filter."""
         parts = {
-            place: [np.asarray(part)[f, i] for part in outcome["weighed"][kind]]
-            for place, (kind, f, i) in self.network.places().items()
+            name: [np.asarray(field)[f, i] for field in outcome["weighed"][kind]]
+            for name, (kind, f, i) in self.network.places().items()
             if outcome["weighed"][kind] is not None
         }
-        central = {(FUSED, name): list(item) for name, item in outcome["weighed_centrally"].items() if item is not None}
+        central = {(FUSED, name): list(at) for name, at in outcome["weighed_centrally"].items() if at is not None}
         return {
-            place: WeighedAt(*(tuple(map(int, part)) for part in columns))
-            for place, columns in (parts | central).items()
+            name: WeighedAt(*(tuple(map(int, field)) for field in columns))
+            for name, columns in (parts | central).items()
         }
 
     def _judged(self, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
         """Return the columns of each part of a judgement, by node and filter."""
-        local = {"estimates": outcome["judged"], "fused": {}}
-        parts = [by_name(self.network, local, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
-        result = {
-            node: {name: JudgementAt(*(int(part[node][name]) for part in parts)) for name in filters}
+        judged = {"estimates": outcome["judged"], "fused": {}}
+        parts = [by_name(self.network, judged, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
+        by_node = {
+            node: {name: JudgementAt(*(int(field[node][name]) for field in parts)) for name in filters}
             for node, filters in parts[0].items()
         }
         central = outcome["judged_centrally"]
-        return result | {FUSED: {name: JudgementAt(*(int(part) for part in item)) for name, item in central.items()}}
+        return by_node | {
+            FUSED: {name: JudgementAt(*(int(column) for column in columns)) for name, columns in central.items()}
+        }
 
 
-_SHARED: WeakValueDictionary[int, Lanes] = WeakValueDictionary()  # by the id of a network, which its entry keeps
-
-
-def shared_lanes(network: Network) -> Lanes:
-    """Return the lanes of this network, made at the first call."""
-    result = _SHARED.get(id(network))
-    if result is None:
-        result = _SHARED[id(network)] = Lanes(network)
-    return result
+shared_lanes = shared(Lanes)  # of a network, made at the first call
 
 
 def _part(i: int, judged: PyTree) -> np.ndarray:

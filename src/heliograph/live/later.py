@@ -41,39 +41,39 @@ class Sweep(Module):
         self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, SmootherStep]:
         """Step all filters into a row, without implausible measurements; return also their smoother steps."""
-        local, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
-        skip = local, {name: central[name] for name in self.network_step.filters.central}
-        after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
-        return after, ({kind: result["smoother_steps"][kind] for kind in self.kinds}, result["central_steps"])
+        by_kind, central = reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
+        skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
+        after, outputs = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
+        return after, ({kind: outputs["smoother_steps"][kind] for kind in self.kinds}, outputs["central_steps"])
 
     def start(self, history: History, row: jax.Array) -> PyTree:
         """Return the filters' states after a row of the history."""
-        local, central, *_ = history.known(row)
-        return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
+        by_kind, central, *_ = history.known(row)
+        return by_kind, {name: central[name] for name in self.network_step.filters.central}, (), (), {}, {}
 
     def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
-        local, central = _over_filters(lambda step, later: step.estimate_from(step.smoothed(later)), steps, later)
-        parts = [local.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
+        by_kind, central = _over_filters(lambda step, later: step.estimate_from(step.smoothed(later)), steps, later)
+        parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
             central |= fusion.step((), parts, jnp.asarray(0))[1]
-        return local, central
+        return by_kind, central
 
 
 def _over_filters(function: Callable[..., object], steps: SmootherStep, *rest: PyTree) -> PyTree:
     """Map a function of one filter's step over the filters of each kind, (filter, node, ...), and the central ones."""
-    local = {
-        kind: jax.vmap(jax.vmap(function))(step, *(part[0][kind] for part in rest)) for kind, step in steps[0].items()
+    by_kind = {
+        kind: jax.vmap(jax.vmap(function))(step, *(tree[0][kind] for tree in rest)) for kind, step in steps[0].items()
     }
-    return local, {name: function(step, *(part[1][name] for part in rest)) for name, step in steps[1].items()}
+    return by_kind, {name: function(step, *(tree[1][name] for tree in rest)) for name, step in steps[1].items()}
 
 
 def _back(step: AbstractSmootherStep, later: PyTree, before: AbstractSmootherStep) -> PyTree:
     return step.back(later, before.mean, before.covariance)
 
 
-Place: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
-Into: TypeAlias = "Callable[[Sweep, History, Place], SmootherStep]"
+StepOfRow: TypeAlias = "tuple[jax.Array, jax.Array]"  # a row, and a step at it or before it
+Into: TypeAlias = "Callable[[Sweep, History, StepOfRow], SmootherStep]"
 
 
 @lru_cache
@@ -86,47 +86,49 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
     # Continuous time: one step per row. Discrete time: also the steps between the rows.
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
-    def run(numbers: list[jax.Array], history: History, place: jax.Array) -> PyTree:
-        item: Sweep = static.filled(numbers)
-        begin, stop = place
+    def run(numbers: list[jax.Array], history: History, span: jax.Array) -> PyTree:
+        sweep: Sweep = static.filled(numbers)
+        begin, stop = span
         last = stop - 1, history.step[stop - 1]
         count = stop - 1 - begin if dt is not None else last[1] - history.step[begin]
         # Shapes of a smoother step, without computing one.
         blank = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, history, last))
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(sweep, history, last))
         )
 
         # One step back: x_k|N from x_(k+1)|N and the smoother step into row k + 1; at the last row x_N|N.
-        def single(i: jax.Array, carry: tuple[Place, SmootherStep, PyTree]) -> tuple[Place, SmootherStep, PyTree]:
+        def single(
+            i: jax.Array, carry: tuple[StepOfRow, SmootherStep, PyTree]
+        ) -> tuple[StepOfRow, SmootherStep, PyTree]:
             now, steps, later = carry
-            before = into(item, history, now)
+            before = into(sweep, history, now)
             passed, ends = _over_filters(_back, steps, later, before), _over_filters(lambda step: step.end(), before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
             return earlier(history, now), before, later
 
         begun = last, blank, _over_filters(lambda step: step.end(), blank)
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
-        return item.outputs(steps, later)
+        return sweep.outputs(steps, later)
 
     return jax.jit(run, compiler_options=understood())
 
 
 def _into_row(dt: int) -> Into:
-    def into(sweep: Sweep, history: History, place: Place) -> SmootherStep:
-        row, _ = place
+    def into(sweep: Sweep, history: History, at: StepOfRow) -> SmootherStep:
+        row, _ = at
         state, received = sweep.start(history, row - 1), history.parts(row)[0]
         return sweep.step(history, row, state, received, history.interval(row, dt), history.step[row])[1]
 
     return into
 
 
-def _earlier_row(history: History, place: Place) -> Place:
-    return place[0] - 1, history.step[place[0] - 1]
+def _earlier_row(history: History, at: StepOfRow) -> StepOfRow:
+    return at[0] - 1, history.step[at[0] - 1]
 
 
-def _into_step(sweep: Sweep, history: History, place: Place) -> SmootherStep:
+def _into_step(sweep: Sweep, history: History, at: StepOfRow) -> SmootherStep:
     """Compute the smoother step at step k, by way of the steps without measurements since the row before."""
-    row, k = place
+    row, k = at
 
     def single(j: jax.Array, state: PyTree) -> PyTree:
         return sweep.step(history, row, state, *history.at_step(row, j), j)[0]
@@ -135,8 +137,8 @@ def _into_step(sweep: Sweep, history: History, place: Place) -> SmootherStep:
     return sweep.step(history, row, state, *history.at_step(row, k), k)[1]
 
 
-def _earlier_step(history: History, place: Place) -> Place:
-    row, k = place
+def _earlier_step(history: History, at: StepOfRow) -> StepOfRow:
+    row, k = at
     return jnp.where(k - 1 == history.step[row - 1], row - 1, row), k - 1
 
 
@@ -146,17 +148,17 @@ class Sweeper:
     def __init__(self, network: Network, dt: int | None):
         self.network = network
         kinds = tuple(k for k, kind in enumerate(network.kinds) if _can_smooth(_of(network, k, kind.filters[0])))
-        items = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-        central = {name: item for name, item in items.items() if _can_smooth(item)}
+        filters = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+        central = {name: filter for name, filter in filters.items() if _can_smooth(filter)}
         if not kinds and not central:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
             )
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
-        fusions = tuple(item for item in AllFilters(network).fusions if self._fuses(item, kinds))
+        fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         with jax.enable_x64(True):
-            self.item = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
-            self._numbers, static = cast(self.item)
+            self.sweep = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds)
+            self._numbers, static = cast(self.sweep)
         self._run = sweep_back(static, dt)
 
     def _fuses(self, fusion: Fused, kinds: tuple[int, ...]) -> bool:
@@ -165,17 +167,17 @@ class Sweeper:
     def estimates(self, history: History, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Return estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
-            local, fused = self._run(self._numbers, history, np.array([begin, stop], dtype=np.int32))
+            by_kind, fused = self._run(self._numbers, history, np.array([begin, stop], dtype=np.int32))
         results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
-        for k, outputs in local.items():
+        for k, outputs in by_kind.items():
             for f, name in enumerate(self.network.kinds[k].filters):
                 for i, node in enumerate(self.network.groups[self.network.kinds[k].group]):
                     results[node][name] = _estimate_of(outputs, outputs.claim, (f, i))
         claims = {node: {name: outputs.claim for name, outputs in filters.items()} for node, filters in results.items()}
         for name, outputs in fused.items():
-            item, claim = self.network.fused[name], outputs.claim
-            if isinstance(item, Fusion):
-                claim = item.claim([claims[node][item.filter] for node in self.network.nodes_with(item.filter)])
+            fusion, claim = self.network.fused[name], outputs.claim
+            if isinstance(fusion, Fusion):
+                claim = fusion.claim([claims[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)])
             results.setdefault(FUSED, {})[name] = _estimate_of(outputs, claim, ())
         return {node: filters for node, filters in results.items() if filters}
 

@@ -103,36 +103,36 @@ class Plant:
 
     def take(self, event: Known, slot: Callable[[], int], width: int) -> None:
         """Add an event to its row, or to a new row in a slot of its own; record the change for `undo`."""
-        place, row = self.rows.find(event)
+        index, row = self.rows.find(event)
         if row is None:
             row = HeldRow(self.rows.key(event), slot(), width)
-            self.rows.insert(place, row)
+            self.rows.insert(index, row)
             self.changes.append(Change(row, None))
         else:
             self.changes.append(Change(row, (row.numbers.copy(), dict(row.events))))
         self.rows.fill(row, event)
-        self.dirty = place if self.dirty is None else min(self.dirty, place)
+        self.dirty = index if self.dirty is None else min(self.dirty, index)
 
     def undo(self) -> list[int]:
         """Undo the recorded changes; return the slots that are free again. Rows that had been stepped become dirty."""
         slots = []
         for row, before in reversed(self.changes):
             if before is None:
-                self.rows.remove(self.rows.place(row.key))
+                self.rows.remove(self.rows.index(row.key))
                 slots.append(row.slot)
             else:
                 row.numbers[:], row.events = before
-        place = min((self.rows.place(row.key) for row, _ in self.changes), default=len(self.rows.held))
-        self.dirty = place if place < len(self.rows.held) else None
+        index = min((self.rows.index(row.key) for row, _ in self.changes), default=len(self.rows.held))
+        self.dirty = index if index < len(self.rows.held) else None
         self.changes = []
         return slots
 
     def link(self, node: str) -> Link:
         """Return the counts of a node."""
-        result = self.links.get(node)
-        if result is None:
-            result = self.links[node] = Link()
-        return result
+        link = self.links.get(node)
+        if link is None:
+            link = self.links[node] = Link()
+        return link
 
     def chain(self) -> list[HeldRow]:
         """Return the rows to step again, and before them the row from which they start."""

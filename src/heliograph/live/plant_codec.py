@@ -52,9 +52,9 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     # Rows, each in a new slot; then their events.
     rows = [_row(fleet, table[i], whole[2 * i], whole[2 * i + 1]) for i in range(count)]
     begin = 0
-    for time, i, place, sequence in zip(times, *(whole[2 * count + j :: 3] for j in range(3)), strict=True):
-        end = begin + fleet.size(place)
-        rows[i].events[place, sequence, time] = values[begin:end]
+    for time, i, node, sequence in zip(times, *(whole[2 * count + j :: 3] for j in range(3)), strict=True):
+        end = begin + fleet.size(node)
+        rows[i].events[node, sequence, time] = values[begin:end]
         begin = end
     held = fleet.rows(rows[0])
     held.hold(rows)
@@ -63,10 +63,10 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     return Plant(name, held, head["now"], origin, forced=head["forced"], links=links)
 
 
-def _row(fleet: Fleet, numbers: np.ndarray, place: int, sequence: int) -> HeldRow:
+def _row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
     slot = fleet.pool.take()
     fleet.pool.table[slot] = numbers
-    local = numbers[fleet.pool.numbers]
-    row = HeldRow((float(local[-1]), place, sequence), slot, len(local) - 1)
-    row.numbers[:] = local
+    values = numbers[fleet.pool.numbers]
+    row = HeldRow((float(values[-1]), node, sequence), slot, len(values) - 1)
+    row.numbers[:] = values
     return row

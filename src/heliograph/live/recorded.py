@@ -91,16 +91,16 @@ def _arrival(event: Event) -> float:
 
 def _joined(parts: Sequence[Record]) -> Record:
     estimates = {
-        node: {name: _stacked([part.estimates[node][name] for part in parts], np.concatenate) for name in filters}
+        node: {name: _stacked([record.estimates[node][name] for record in parts], np.concatenate) for name in filters}
         for node, filters in parts[0].estimates.items()
     }
-    return Record(np.concatenate([part.time for part in parts]), parts[0].states, None, {}, estimates)
+    return Record(np.concatenate([record.time for record in parts]), parts[0].states, None, {}, estimates)
 
 
 def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    results = [part for _, part in parts]
+    results = [estimates for _, estimates in parts]
     estimates = {
-        node: {name: _stacked([part[node][name] for part in results], np.stack) for name in filters}
+        node: {name: _stacked([estimates_then[node][name] for estimates_then in results], np.stack) for name in filters}
         for node, filters in (results[0] if results else {}).items()
     }
     return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)

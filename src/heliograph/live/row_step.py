@@ -72,24 +72,24 @@ class NetworkStep(Module):
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
-        after, result = plausible_step(self.filters, state, self.groups(received), u, k)
-        return after, {name: result[name] for name in OUTPUTS}
+        after, outputs = plausible_step(self.filters, state, self.groups(received), u, k)
+        return after, {name: outputs[name] for name in OUTPUTS}
 
     def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Step all filters with every measurement, implausible or not."""
-        after, result = self.filters.step(state, self.groups(received), u, k)
-        return after, {name: result[name] for name in OUTPUTS}
+        after, outputs = self.filters.step(state, self.groups(received), u, k)
+        return after, {name: outputs[name] for name in OUTPUTS}
 
     def without(
         self, first: tuple[PyTree, PyTree], state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, PyTree]:
         """Repeat the step, each filter without the measurements that it finds implausible."""
-        after, result = step_without(self.filters, first, state, self.groups(received), u, k)
-        return after, {name: result[name] for name in OUTPUTS}
+        after, outputs = step_without(self.filters, first, state, self.groups(received), u, k)
+        return after, {name: outputs[name] for name in OUTPUTS}
 
     def groups(self, received: jax.Array) -> list[jax.Array]:
         """Return the measurements of each group's nodes, (node, received)."""
-        return [received[np.array(place, dtype=int)] for place in self.places]  # of nodes without a sensor none
+        return [received[np.array(columns, dtype=int)] for columns in self.places]  # of nodes without a sensor none
 
 
 class Layout(NamedTuple):
@@ -149,8 +149,8 @@ class RowStep:
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
         if self._code is not None:
-            result: np.ndarray = self._code(rows)
-            return result
+            stepped: np.ndarray = self._code(rows)
+            return stepped
         width, together = (1, 1) if alone else (WIDTH, TOGETHER)
         run = _by_xla(self._layout, width, together)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
@@ -158,8 +158,8 @@ class RowStep:
             count = min(width, len(rows) - begin)
             filled[:count] = rows[begin : begin + count]
             with jax.enable_x64(True):
-                result = run(self._numbers, filled, np.int32(-(-count // together)))
-            done[begin : begin + count] = np.asarray(result)[:count]
+                stepped = run(self._numbers, filled, np.int32(-(-count // together)))
+            done[begin : begin + count] = np.asarray(stepped)[:count]
         return done
 
 
@@ -168,8 +168,8 @@ def _stepped(layout: Layout) -> Callable[[list[jax.Array], jax.Array], jax.Array
     """Return the function of one row, the same one for layouts that are equal."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
-        after, result = layout.static.filled(numbers).step(*layout.parts(row))
-        return jnp.concatenate([row_of(after), row_of(result)])
+        after, outputs = layout.static.filled(numbers).step(*layout.parts(row))
+        return jnp.concatenate([row_of(after), row_of(outputs)])
 
     return step
 
@@ -179,18 +179,18 @@ def _by_xla(layout: Layout, width: int, together: int) -> PyTree:
     """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        item: NetworkStep = layout.static.filled(numbers)
+        network_step: NetworkStep = layout.static.filled(numbers)
 
         # One step with all measurements, and whether a filter finds one of them implausible.
         def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
-            after, result = item.judged(*layout.parts(row))
-            return jnp.concatenate([row_of(after), row_of(result)]), implausible(result)
+            after, outputs = network_step.judged(*layout.parts(row))
+            return jnp.concatenate([row_of(after), row_of(outputs)]), implausible(outputs)
 
         # The step again, for each filter without the measurements that it finds implausible.
         def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
             n = layout.state.size
             first = layout.state.tree(stepped[:n]), layout.outputs.tree(stepped[n:])
-            return jnp.concatenate([row_of(part) for part in item.without(first, *layout.parts(row))])
+            return jnp.concatenate([row_of(leaf) for leaf in network_step.without(first, *layout.parts(row))])
 
         # The second step is taken only if a row of the turn needs it.
         def turn(i: jax.Array, done: jax.Array) -> jax.Array:

@@ -23,7 +23,7 @@ class HeldRow:
 
     def has_data(self) -> bool:
         """Return whether the row has an event of a node; its other events are inputs."""
-        return any(place >= 0 for place, _, _ in self.events)
+        return any(node >= 0 for node, _, _ in self.events)
 
 
 class Rows:
@@ -43,7 +43,7 @@ class Rows:
 
     def key(self, event: Known) -> Key:
         """Return the key of the row that an event belongs to."""
-        return (event.time, 0, 0) if self.joint else (event.time, event.place, event.sequence)
+        return (event.time, 0, 0) if self.joint else (event.time, event.node_index, event.sequence)
 
     def base(self, watermark: float) -> int:
         """Return the index of the newest row older than the watermark, which becomes the base."""
@@ -60,15 +60,15 @@ class Rows:
         if self.key(event) > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
         base = self.finalise(watermark)[0]
-        place, row = self.find(event)
+        index, row = self.find(event)
         held = None if row is None else row.events.get(event.name)
-        if place < base or (place == base and held is None):
+        if index < base or (index == base and held is None):
             return "late"
         if row is None:
             return "used"
         if held is not None:
             return "duplicate" if np.array_equal(held, event.values, equal_nan=True) else "conflict"
-        there = row.numbers[self.places[event.place]]
+        there = row.numbers[self.places[event.node_index]]
         return "conflict" if np.any(~np.isnan(there) & ~np.isnan(event.values)) else "used"
 
     def find(self, event: Known) -> tuple[int, HeldRow | None]:
@@ -76,26 +76,26 @@ class Rows:
         key = self.key(event)
         if key > self.keys[-1]:
             return len(self.keys), None
-        place = bisect_left(self.keys, key)
-        there = self.keys[place] == key
-        return place, self.held[place] if there else None
+        index = bisect_left(self.keys, key)
+        there = self.keys[index] == key
+        return index, self.held[index] if there else None
 
-    def insert(self, place: int, row: HeldRow) -> None:
+    def insert(self, index: int, row: HeldRow) -> None:
         """Insert a row at the index that `find` returned."""
-        self.keys.insert(place, row.key)
-        self.held.insert(place, row)
+        self.keys.insert(index, row.key)
+        self.held.insert(index, row)
 
-    def place(self, key: Key) -> int:
+    def index(self, key: Key) -> int:
         """Return the index of the row with this key, or the index at which it would be inserted."""
         return bisect_left(self.keys, key)
 
-    def remove(self, place: int) -> None:
+    def remove(self, index: int) -> None:
         """Remove a row."""
-        del self.keys[place], self.held[place]
+        del self.keys[index], self.held[index]
 
     def fill(self, row: HeldRow, event: Known) -> None:
         """Write an event's values into its row; NaN is left out."""
-        there = row.numbers[self.places[event.place]]
+        there = row.numbers[self.places[event.node_index]]
         if row.events:
             np.copyto(there, event.values, where=~np.isnan(event.values))
         else:  # nothing is there yet

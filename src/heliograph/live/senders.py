@@ -52,12 +52,12 @@ class LossChain(NamedTuple):
         return LossChain(np.array(loss), np.asarray(modes.transition), np.asarray(modes.initial))
 
     @staticmethod
-    def of_filter(item: EventFilter | StochasticEventFilter) -> "LossChain":
+    def of_filter(filter: EventFilter | StochasticEventFilter) -> "LossChain":
         """Losses of the link of an event filter."""
-        channel = first(item.channel)
+        channel = first(filter.channel)
         nothing = ~np.any(np.asarray(channel.present), axis=1)
         loss = np.asarray(channel.chance) @ nothing
-        return LossChain(loss, np.asarray(channel.transition), np.asarray(item.initial))
+        return LossChain(loss, np.asarray(channel.transition), np.asarray(filter.initial))
 
     def in_a_row(self, apart: int, count: int) -> float:
         """Return the probability that `count` transmissions, so many steps apart, are all lost."""

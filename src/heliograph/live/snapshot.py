@@ -27,7 +27,7 @@ def versions() -> Identity:
 def network_identity(network: Network, program: str, options: Mapping[str, object]) -> Identity:
     """Return versions, precision, options, names, sizes, hashes of each part's numbers, and a hash of the program."""
     parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
-    parts |= {f"fusion {name!r}": item for name, item in (network.fused | network.meshes).items()}
+    parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
     return {
         **versions(),
@@ -38,7 +38,7 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
         "filters": ", ".join(filters),
         **{f"option {name}": f"{value!r}" for name, value in options.items()},
         "numbers of the plant": short_name(network.plant),
-        **{f"numbers of {name}": short_name(part) for name, part in parts.items()},
+        **{f"numbers of {name}": short_name(tree) for name, tree in parts.items()},
         "what is computed": short_name(program),
     }
 
@@ -52,16 +52,16 @@ def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> 
         raise fail(what, f"the state of what is here ({here})", f"one that differs ({there})")
 
 
-def short_name(part: PyTree) -> str:
-    """Hash all numbers in a part, or a text."""
-    if isinstance(part, str):
-        return sha256(part.encode()).hexdigest()[:DIGITS]
-    result = sha256()
-    for leaf in jax.tree.leaves(part):
+def short_name(numbers: PyTree) -> str:
+    """Hash all numbers in a tree, or a text."""
+    if isinstance(numbers, str):
+        return sha256(numbers.encode()).hexdigest()[:DIGITS]
+    digest = sha256()
+    for leaf in jax.tree.leaves(numbers):
         if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
             array = np.asarray(leaf)
-            result.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
-    return result.hexdigest()[:DIGITS]
+            digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+    return digest.hexdigest()[:DIGITS]
 
 
 HEAD = "head"

@@ -22,12 +22,12 @@ class Static(NamedTuple):
     def filled(self, numbers: Sequence[jax.Array]) -> PyTree:
         """Return the object with these arrays."""
         rest = iter(numbers)
-        return self.tree.unflatten([next(rest) if part is None else part for part in self.parts])
+        return self.tree.unflatten([next(rest) if leaf is None else leaf for leaf in self.parts])
 
 
-def cast(item: object) -> tuple[list[jax.Array], Static]:
+def cast(whole: object) -> tuple[list[jax.Array], Static]:
     """Split an object into arrays, on the device, and its structure. To be called in the float64 scope."""
-    leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, item))
+    leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, whole))
     numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape
     return numbers, Static(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
 

@@ -38,8 +38,8 @@ class NativeStepper:
 
     def put(self, leaves: Sequence[np.ndarray]) -> None:
         """Set the leaves of the filter's state."""
-        for place, leaf in zip(self._state, leaves, strict=True):
-            place[...] = leaf
+        for leaf_of_state, leaf in zip(self._state, leaves, strict=True):
+            leaf_of_state[...] = leaf
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
         """Compute a step; False, with the state unchanged, if data are not finite or something is implausible."""
@@ -100,8 +100,8 @@ def _judged(
     static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
     """Step a filter from its arrays; return judgement, whether to refuse, leaves of the state and of the estimate."""
-    item: AbstractFilter = static.filled(numbers)
-    after, estimate, judgement = item.step_judged(state, z, u, k)
+    filter: AbstractFilter = static.filled(numbers)
+    after, estimate, judgement = filter.step_judged(state, z, u, k)
     spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
     flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
     return jnp.stack(judgement), flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)

@@ -2,7 +2,6 @@
 
 from functools import cached_property
 from typing import Any
-from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.limits import LimitsLike, limits_of
+from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -84,8 +84,8 @@ class Stream:
             self._last = k
         if outside is not None:
             self.dropped += outside
-        result: Estimate = placed.estimate.unflatten(stepper.estimate)
-        return with_sound_claim(result) if np.isnan(stepper.judgement[0]) else result
+        estimate: Estimate = placed.estimate.unflatten(stepper.estimate)
+        return with_sound_claim(estimate) if np.isnan(stepper.judgement[0]) else estimate
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
         """Refuse implausible values, or accept the step that was flagged."""
@@ -187,24 +187,17 @@ class _Placed:
         """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
         with jax.enable_x64(True):
             text = by_xla(self._static).lower(self.numbers, self._start, *self._data).as_text()
-        item = self.filter
+        filter = self.filter
         return {
             **versions(),
             "precision": ", ".join(sorted({str(leaf.dtype) for leaf in self.numbers})),
-            "filter": type(item).__name__,
-            "states": ", ".join(item.states),
-            "inputs": ", ".join(item.inputs),
-            "numbers received": str(item.received),
+            "filter": type(filter).__name__,
+            "states": ", ".join(filter.states),
+            "inputs": ", ".join(filter.inputs),
+            "numbers received": str(filter.received),
             "numbers": short_name(self.numbers),
             "what is computed": short_name(text),
         }
 
 
-_SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id of a filter, which its entry keeps
-
-
-def _place(filter: AbstractFilter) -> _Placed:
-    result = _SHARED.get(id(filter))
-    if result is None:
-        result = _SHARED[id(filter)] = _Placed(filter)
-    return result
+_place = shared(_Placed)

@@ -181,7 +181,7 @@ class Timeline:
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
         refused = bool(self._judges.implausible([Candidate(0, plant, event, row)]))
-        if not refused and event.place < 0 and self._lanes.dt is not None:
+        if not refused and event.node_index < 0 and self._lanes.dt is not None:
             after = fleet.pool.trial(np.array([row.slot]), np.full((1, self._lanes.given), np.nan), np.inf)
             refused = self._judges.why_inputs(after[0]) is not None
         return refused
@@ -224,13 +224,13 @@ class Timeline:
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
         if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
-        place, slots = rows.after(time), [row.slot for row in rows.held]
-        if not by_steps or rows.keys[place - 1][0] < time:
-            self._fleet.look(rows.held[place - 1], time, self._spare)
-            slots.insert(place, self._spare)
+        index, slots = rows.after(time), [row.slot for row in rows.held]
+        if not by_steps or rows.keys[index - 1][0] < time:
+            self._fleet.look(rows.held[index - 1], time, self._spare)
+            slots.insert(index, self._spare)
         else:
-            place -= 1
-        return self._lanes.sweeper.estimates(self._fleet.pool.history(slots), place, len(slots))
+            index -= 1
+        return self._lanes.sweeper.estimates(self._fleet.pool.history(slots), index, len(slots))
 
     def final(self) -> Record:
         """Return the estimates that became final since the last call, one for each row with a measurement.
@@ -278,11 +278,11 @@ class Timeline:
         sizes, name = self._fleet.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", shown(node))
-        place, size = sizes[node]
+        index, size = sizes[node]
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
         came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
-        return Known(place, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
+        return Known(index, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
@@ -294,9 +294,9 @@ class Timeline:
 
     def _named(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""
-        result = self._lanes.step_rows.outputs.tree(outputs)
-        mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
-        covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
+        estimates = self._lanes.step_rows.outputs.tree(outputs)
+        mean = by_name(self.network, estimates, lambda estimate: np.asarray(estimate.mean), -3)
+        covariance = by_name(self.network, estimates, lambda estimate: np.asarray(estimate.covariance), -4)
         return {
             node: {
                 name: with_sound_claim(Estimate(mean[node][name], covariance[node][name], claim))

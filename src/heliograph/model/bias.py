@@ -40,10 +40,10 @@ def with_bias(
         sensor: its sensor.
         bias: standard deviation of each bias (biases,), or one for all; or the plant of b, independent of the first,
             whose inputs are some of its.
-        time: T, in which a bias of a given deviation is forgotten to 1/e, of each (biases,) or of all.
-        dt: time of a step, or the name of the input that says it.
-        coupling: E, how each bias drives the plant (n, biases).
-        loading: D, in which outputs each bias is (outputs, biases).
+        time: T, in which a bias of a given deviation is forgotten to 1/e, of each (biases,) or of all (default inf).
+        dt: time of a step, or the name of the input that says it (default 1).
+        coupling: E, how each bias drives the plant (n, biases) (default none).
+        loading: D, in which outputs each bias is (outputs, biases) (default none).
 
     Raises:
         ValueError: a negative deviation, a time that is not positive, another input, shapes that do not fit.
@@ -93,18 +93,18 @@ def _gauss_markov(
 
 def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """The plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
-    n, parts = len(plant.states), (plant, bias)
+    n, models = len(plant.states), (plant, bias)
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
     renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
     states = (*plant.states, *renamed.values())
     circular = (*plant.circular, *(renamed[name] for name in bias.circular))
     # Both laws of the initial state, as noise laws.
-    laws = [part.deviation or Gaussian(part.initial_covariance) for part in parts]
-    centers = [part.initial_mean - law.mean for part, law in zip(parts, laws, strict=True)]
+    laws = [model.deviation or Gaussian(model.initial_covariance) for model in models]
+    centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
     center = library(*centers).concatenate(centers)
-    noises = [part.noise for part in parts if isinstance(part.noise, AbstractNoise)]
-    constant = len(noises) == 2 and not any(isinstance(m, OfInputs) for part in parts for m in vars(part).values())
+    noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
+    constant = len(noises) == 2 and not any(isinstance(m, OfInputs) for model in models for m in vars(model).values())
     pick = np.eye(len(plant.inputs))[[plant.inputs.index(name) for name in bias.inputs]]  # its inputs among all
     # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; B_b] u + [w; xi].
     if isinstance(plant, LinearPlant) and constant:
@@ -115,8 +115,8 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
             matrix, Independent(noises), center, Independent(laws), driven, states, plant.inputs, circular
         )
     # As functions; Gaussian laws are their covariances.
-    covariance = _diagonal([part.initial_covariance for part in parts])
-    start = covariance if all(part.deviation is None for part in parts) else Independent(laws)
+    covariance = _diagonal([model.initial_covariance for model in models])
+    start = covariance if all(model.deviation is None for model in models) else Independent(laws)
     return _by_functions(plant, bias, (coupling, pick), (center, start), (states, circular))
 
 
@@ -140,7 +140,7 @@ def _by_functions(
         return jnp.concatenate([moved, bias.transition(x[n:], pick @ u) + bias.noise_mean()])
 
     # A linear plant stays one, unless its noise has a mean that a covariance by function cannot hold.
-    means = [part.noise.mean for part in (plant, bias) if isinstance(part.noise, AbstractNoise)]
+    means = [model.noise.mean for model in (plant, bias) if isinstance(model.noise, AbstractNoise)]
     if not isinstance(plant, LinearPlant) or not all(is_zero(mean) for mean in means):
         return Plant(move, spread, *start, states, plant.inputs, circular)
 

@@ -9,8 +9,8 @@ import numpy as np
 from heliograph.model.channel import Channel, amplify_and_forward
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered
-from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.sensor import AnySensor, check_sensor
+from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
+from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.traced import library
@@ -40,8 +40,8 @@ def centred(channel: Channel, reference: "Float[ArrayLike, '*m'] | OverTime") ->
         ValueError: a reference of another length than what is sent; a channel that is late or erases: put
             `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
     """
-    result: Channel = at_each_step(_centred, channel, reference)
-    return result
+    less_reference: Channel = at_each_step(_centred, channel, reference)
+    return less_reference
 
 
 def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
@@ -55,6 +55,14 @@ def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> 
     assert isinstance(forgets, AbstractRandomAffine)
     gain = forgets.moments(1).mean[:-1, :-1]
     return amplify_and_forward([known(np.eye(len(r)), -r), channel, known(np.eye(channel.outputs), gain @ r)])
+
+
+def predicted_signal(
+    plant: AbstractPlant, sensor: AbstractSensor, x: Float[Array, " n"], u: ArrayLike
+) -> Float[jax.Array, " m"]:
+    """Prediction h(f(x, u) + E w) + E v of a signal from the state a step before, which both ends of a link compute."""
+    predicted = plant.transition(jnp.asarray(x), jnp.asarray(u)) + plant.noise_mean()
+    return jnp.asarray(sensor.measure(predicted) + sensor.noise.mean)
 
 
 def expected_signal(

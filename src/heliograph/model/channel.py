@@ -59,6 +59,14 @@ def hop(
     components, which are independent then. A relay's hop has its amplification factor; a sensor's has 1. All numbers
     may be traced by JAX, those of the laws too. `delay` as for `delayed`.
 
+    Args:
+        gain: law of g, or a number.
+        noise: law, covariance (m, m) or variance of n, in the unit of z squared.
+        power: E, not negative (default 1).
+        amplification: of a relay, z per unit of what it receives (default 1).
+        dimension: number of components where `noise` is a variance (default 1).
+        delay: in steps, or its law (default: none).
+
     Raises:
         ValueError: a negative power, a noise that is no covariance, numbers that are not finite.
     Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
@@ -73,6 +81,9 @@ def hop(
 
 def perfect(dimension: int = 1) -> GainAndNoise:
     """The channel that delivers y as it is: z = y.
+
+    Args:
+        dimension: number of components of y (default 1).
 
     Raises:
         ValueError: a dimension that is not a whole number of components.
@@ -104,6 +115,10 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
     Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
     be late, and the delays add up; a relay with a random delay may forward one value twice, with one noise m.
 
+    Args:
+        hops: in the order of the way, from the sensor to the filter; each takes as many components as the one before
+            sends.
+
     Raises:
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
@@ -133,6 +148,11 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
 
     Where the receiver knows of the loss, it is an `erasure`.
 
+    Args:
+        channel: that of the packets which arrive.
+        arrival: probability that a packet arrives, from 0 to 1.
+        radius: how far that probability may be off (default 0: it is known).
+
     Raises:
         ValueError: an arrival probability outside [0, 1].
     """
@@ -146,6 +166,10 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
 
     Filters skip what is NaN, so give a filter the channel inside, without the erasure. A relay forwards NaN as NaN.
 
+    Args:
+        channel: that of the packets which arrive.
+        arrival: probability that a packet arrives, from 0 to 1.
+
     Raises:
         ValueError: an arrival probability outside [0, 1]; later, when asked for moments.
     """
@@ -154,6 +178,10 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
     """The relayed signal and the direct one, both received: z = (z_relay, z_direct), independent given y.
+
+    Args:
+        relayed: channel through the relay.
+        direct: channel of the same y past it.
 
     Raises:
         ValueError: channels that take different numbers of inputs.
@@ -165,6 +193,9 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     """Each channel carries its own part of y: the first its first components, and so on.
+
+    Args:
+        channels: one for each part of y, in its order.
 
     Raises:
         ValueError: no channels.
@@ -180,6 +211,9 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
 def mean_gain(channel: Channel) -> Channel:
     """The channel that most people would design for: every gain taken as its mean, with the noise as it is.
 
+    Args:
+        channel: of random gains; it may vary over time.
+
     Raises:
         ValueError: a gain law that does not know its mean, a channel that remembers.
     """
@@ -188,8 +222,8 @@ def mean_gain(channel: Channel) -> Channel:
         check_forgets("channel taken at its mean gain", as_maps("channel taken at its mean gain", [channel])[0])
         return channel.mean_gain()
 
-    result: Channel = at_each_step(mean_of, channel)
-    return result
+    at_mean: Channel = at_each_step(mean_of, channel)
+    return at_mean
 
 
 def check_link(
@@ -239,14 +273,14 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
         case GainAndNoise():
             return _through(channel, sent)
         case Series():
-            for part in channel.maps:
-                sent = carried(part, sent)
+            for affine in channel.maps:
+                sent = carried(affine, sent)
             return sent
         # Outputs of parts stand one after another.
         case Stack():
-            starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
+            starts = np.cumsum([0, *(affine.outputs for affine in channel.maps)])
             items = zip(starts, channel.maps, strict=False)
-            return tuple(int(start) + i for start, part in items for i in carried(part, sent))
+            return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
         case Erasure() | OneStepLate():
             return carried(channel.base, sent)
         case Delayed():  # one of the angles that were sent arrives; a time stamp stands after it

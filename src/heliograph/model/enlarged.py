@@ -29,6 +29,11 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
     The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
 
+    Args:
+        plant: linear.
+        sensor: linear.
+        channel: one that delivers late, by up to D steps.
+
     Raises:
         ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that
             depends on inputs.
@@ -173,13 +178,13 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     spread, wander, start_at = [], [], []
     for name, clock in clocks.items():
         start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
-        for part in ("offset", "drift", "wander"):
-            scalar(f"{part} of the clock of {name!r}", getattr(clock, part), 0.0)
+        for field in ("offset", "drift", "wander"):
+            scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
         spread += [clock.offset**2, clock.drift**2]
         wander += [0.0, clock.wander]
     # o+ = o + dt d, d+ = d.
     move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
-    names = [f"{name}_{part}" for name in clocks for part in ("offset", "drift")]
+    names = [f"{name}_{field}" for name in clocks for field in ("offset", "drift")]
     if isinstance(plant, LinearPlant):
         center = library(start_at).stack([library(start_at).asarray(x) for x in start_at])
         drifting = LinearPlant(move, np.diag(wander), center, np.diag(spread), states=names)
@@ -221,20 +226,23 @@ class JointSensor(AbstractSensor):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """All of them."""
-        return jnp.concatenate([part.measure(x) for part in self.parts])
+        return jnp.concatenate([sensor.measure(x) for sensor in self.parts])
 
 
 def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
 
+    Args:
+        sensors: by node; the outputs are named NODE_OUTPUT.
+
     Raises:
         ValueError: no sensors, or one that varies.
     """
-    parts = table("sensors", sensors, "sensors of nodes")
-    if not parts:
+    by_node = table("sensors", sensors, "sensors of nodes")
+    if not by_node:
         raise fail("sensors", "at least one", "none")
-    for name, part in parts.items():
-        instance(f"sensor of node {name!r}", part, AbstractSensor, "one that does not vary")
-    outputs = tuple(f"{name}_{output}" for name, part in parts.items() for output in part.outputs)
-    noise = Independent([part.noise for part in parts.values()])
-    return JointSensor(parts=tuple(parts.values()), noise=noise, outputs=outputs)
+    for name, sensor in by_node.items():
+        instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary")
+    outputs = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.outputs)
+    noise = Independent([sensor.noise for sensor in by_node.values()])
+    return JointSensor(parts=tuple(by_node.values()), noise=noise, outputs=outputs)

@@ -65,6 +65,9 @@ class Innovation(Module):
 def weakest(claims: list[Claim]) -> Claim:
     """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
 
+    Args:
+        claims: at least one.
+
     Raises:
         ValueError: no claims, or something else among them.
     """

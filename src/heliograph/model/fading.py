@@ -40,6 +40,13 @@ def gilbert_elliott(
     `good` and `bad` are any channels, with losses too: `erasure(link, arrival)` in each makes losses in bursts. It
     starts in its stationary law. Links of one `name` are good and bad together.
 
+    Args:
+        good: channel at the steps at which the link is good.
+        bad: channel at the others, of the same shape.
+        fail: probability per step that a good link becomes bad.
+        recover: probability per step that a bad link becomes good.
+        name: links of one name share their state (default: none is shared).
+
     Raises:
         ValueError: probabilities outside [0, 1], both zero, or channels of different shapes.
     Source: Gilbert (1960), Elliott (1963).
@@ -59,6 +66,12 @@ def markov_fading(
 
     `transition` is P(next j | now i), started in its stationary law, or a chain. Links of one `name`, or of
     chains of one name, move together.
+
+    Args:
+        gains: numbers (modes,), or a channel for each mode.
+        transition: probabilities (modes, modes), row i those after mode i; or a `MarkovChain`.
+        noise: as for `hop`, where gains are numbers (default: none, for channels).
+        name: links of one name share their mode (default: none is shared).
 
     Raises:
         ValueError: gains without a noise or channels with one, not one for each mode, rows that are no probabilities.
@@ -88,6 +101,14 @@ def autoregressive_fading(
 
     `noise` is as for a hop, with `dimension` components where it is a variance. Links of one `name` drift together,
     each with its own mean and deviation.
+
+    Args:
+        mean: of the gain.
+        deviation: standard deviation of the gain, not negative.
+        correlation: of the gain from one step to the next, from -1 to 1.
+        noise: law, covariance (m, m) or variance of n, in the unit of z squared.
+        dimension: number of components where `noise` is a variance (default 1).
+        name: links of one name drift together (default: none is shared).
 
     Raises:
         ValueError: a negative deviation, a correlation outside [-1, 1], a noise that is no covariance.
@@ -165,6 +186,9 @@ def without_memory(channel: Channel) -> Channel:
     Each step's draws have the law that they have in the channel (of one that does not vary: in the long run); no two
     steps depend on each other. A channel that forgets is itself.
 
+    Args:
+        channel: of any memory by modes; it may vary over time.
+
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
@@ -172,7 +196,7 @@ def without_memory(channel: Channel) -> Channel:
         return channel
     if not isinstance(channel, OverTime):
         return forgetful(channel)
-    steps = [joint_modes(item, order=2) for item in unstack(channel)]
+    steps = [joint_modes(step, order=2) for step in unstack(channel)]
     return over_time([mixed(step, law) for step, law in zip(steps, laws(steps), strict=True)])
 
 
@@ -181,6 +205,9 @@ def memory_matters(channel: Channel) -> bool:
 
     Memory in the variance of noise alone does not matter to it. An uncertain chain always may.
 
+    Args:
+        channel: of a node; it may vary over time.
+
     Raises:
         ValueError: a channel with a memory of another kind.
     """
@@ -188,7 +215,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(item) for item in unstack(channel)]
+    steps = [joint_modes(step) for step in unstack(channel)]
     return not harmless(steps, not isinstance(channel, OverTime))
 
 

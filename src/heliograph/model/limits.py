@@ -64,7 +64,7 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
     if values.shape not in ((2,), (received, 2)):
         raise fail("limits", expected, shown(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
-    pairs = [[end if item is None else item for item, end in zip(row, everything, strict=True)] for row in rows]
+    pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
     intervals = _numbers("limits", pairs, expected)
     if np.any(~(intervals[:, 0] < intervals[:, 1])):
         raise fail("limits", "a low end below the high one", shown(limits))

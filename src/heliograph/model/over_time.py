@@ -47,9 +47,9 @@ def _arrays(tree: object) -> list[PyTree]:
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
-def stack(items: Sequence[T]) -> T:
+def stack(models: Sequence[T]) -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis."""
-    flat = [jax.tree.flatten(item) for item in items]
+    flat = [jax.tree.flatten(model) for model in models]
     if len({_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     pieces = zip(*(leaves for leaves, _ in flat), strict=True)
@@ -58,9 +58,9 @@ def stack(items: Sequence[T]) -> T:
     return steps_of_parts
 
 
-def structure(item: object) -> Hashable:
+def structure(model: object) -> Hashable:
     """Return a key that is equal for model objects which differ in nothing but the values of their arrays."""
-    return _structure(*jax.tree.flatten(item))
+    return _structure(*jax.tree.flatten(model))
 
 
 def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
@@ -82,6 +82,9 @@ def over_time(items: Sequence[object]) -> OverTime:
     """One model object per time step (a channel, a plant, ...) as a single object that varies in time.
 
     What channels remember without a name is one memory over time, whose transition may differ from step to step.
+
+    Args:
+        items: objects of one structure, one for each step.
 
     Raises:
         ValueError: no items, or items that differ in structure.
@@ -120,9 +123,9 @@ def steps_covered(tree: object) -> int | None:
     return min(steps) if steps else None
 
 
-def unstack(item: object) -> list[PyTree]:
+def unstack(model: object) -> list[PyTree]:
     """The objects of each step, as they were given to `over_time`; the object itself alone where it does not vary."""
-    return [at(item, i) for i in range(item.steps)] if isinstance(item, OverTime) else [item]
+    return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 
 def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
@@ -131,6 +134,6 @@ def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
     return function(*items) if steps is None else over_time([function(*at(items, k)) for k in range(steps)])
 
 
-def first(item: object) -> PyTree:
+def first(model: object) -> PyTree:
     """A plant, sensor or channel at its first step."""
-    return at(item, 0) if isinstance(item, OverTime) else item
+    return at(model, 0) if isinstance(model, OverTime) else model

@@ -216,7 +216,7 @@ class LinearPlant(AbstractPlant):
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         # Inputs: as many as B has columns, or as have names where something depends on them.
-        varies = any(callable(item) for item in (matrix, input_matrix, noise))
+        varies = any(callable(entry) for entry in (matrix, input_matrix, noise))
         if varies and not inputs:
             raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
         count = None if inputs is None or not varies else len(name_list("input names", inputs))

@@ -190,9 +190,9 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     return gain, offset, spread, live, talks
 
 
-def _tile(item: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
+def _tile(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """One array of a plant or sensor for each step."""
-    value = np.asarray(read(item.values if isinstance(item, OverTime) else item), dtype=np.float64)
+    value = np.asarray(read(model.values if isinstance(model, OverTime) else model), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]
     return np.broadcast_to(value, (horizon, *value.shape))

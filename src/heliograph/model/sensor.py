@@ -152,7 +152,7 @@ def _shape_of(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
     first_, second = (shape(states) for states in LONG)
     if first_ is not None and second is not None:
         return first_ if first_ == second else (1,)
-    taken = [item for states in SHORT if (item := shape(states)) is not None]
+    taken = [taken_shape for states in SHORT if (taken_shape := shape(states)) is not None]
     return taken[0] if len(taken) == 1 else (1,)
 
 
@@ -183,9 +183,9 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
     refuse_angles(name, plant, sensor)
 
 
-def refuse_angles(name: str, *parts: AnyPlant | AnySensor) -> None:
+def refuse_angles(name: str, *models: AnyPlant | AnySensor) -> None:
     """Raise ValueError where a state or an output is an angle, for what knows numbers on a line alone."""
-    circular = [item for part in parts for item in first(part).circular]
+    circular = [angle for model in models for angle in first(model).circular]
     if circular:
         raise fail(name, "no angles (cubature, extended, mixture and multiple model filters take them)", circular)
 

@@ -128,10 +128,10 @@ class AbstractTrigger(Module):
         """Numbers about losses that arrive behind z, from the sender before this step."""
         sent = reason > 0
         if self.losses == "numbered":
-            result = jnp.where(arrived & sent, sender.lost.astype(float), jnp.nan)
+            flags = jnp.where(arrived & sent, sender.lost.astype(float), jnp.nan)
         else:
-            result = (sent & ~arrived).astype(float)
-        return result[: self.side_information(len(result))]
+            flags = (sent & ~arrived).astype(float)
+        return flags[: self.side_information(len(flags))]
 
 
 class AbstractThreshold(AbstractTrigger):
@@ -302,10 +302,10 @@ class Periodic(AbstractTrigger):
 def threshold(delta: ArrayLike) -> Float[Array, "..."]:
     """A delta, which is positive, or one for each component."""
     report_domain("delta", delta, POSITIVE)
-    result: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
-    if not is_traced(result) and not np.all(result > 0):
-        raise fail("delta", "a positive number, or one for each component", shown(np.asarray(result).tolist()))
-    return result
+    checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
+    if not is_traced(checked) and not np.all(checked > 0):
+        raise fail("delta", "a positive number, or one for each component", shown(np.asarray(checked).tolist()))
+    return checked
 
 
 def one_of(name: str, value: object, kinds: object) -> Any:

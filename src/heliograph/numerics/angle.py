@@ -24,8 +24,8 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
         circular: names of angles.
         names: all names, in the order of the components.
     """
-    given = [str(item) for item in items(name, circular, "names")]
-    unknown = [item for item in given if item not in names]
+    given = [str(angle) for angle in items(name, circular, "names")]
+    unknown = [angle for angle in given if angle not in names]
     if unknown or len(set(given)) < len(given):
         raise fail(name, f"some of {list(names)}, each once", given)
     return tuple(i for i, single in enumerate(names) if single in given)
@@ -41,8 +41,8 @@ def nearest(value: A, reference: Array, angles: Angles) -> A:
     xp = library(value, reference)
     turns = xp.round((value - reference) / TURN)
     chosen = np.isin(np.arange(np.shape(value)[-1]), angles) & ~xp.isnan(turns)
-    result: A = xp.where(chosen, value - TURN * turns, value)
-    return result
+    unwrapped: A = xp.where(chosen, value - TURN * turns, value)
+    return unwrapped
 
 
 def wrapped(value: A, angles: Angles) -> A:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable
 from functools import cache, wraps
 from inspect import signature
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
-from weakref import ref
+from weakref import WeakValueDictionary, ref
 
 import jax
 import numpy as np
@@ -30,24 +30,41 @@ def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, 
     def known(*given: Any, **named: Any) -> T:
         if not given and first not in named:
             return function(*given, **named)  # which says what is missing
-        item, rest = (given[0], given[1:]) if given else (named.pop(first), ())
+        owner, rest = (given[0], given[1:]) if given else (named.pop(first), ())
         # Key: identity of the object, and the other arguments.
-        place, requested = id(item), (rest, tuple(named.items()))
-        answers = results[place][1] if place in results else {}
+        identity, requested = id(owner), (rest, tuple(named.items()))
+        answers = results[identity][1] if identity in results else {}
         if requested in answers:
             return answers[requested]
-        result = function(item, *rest, **named)
+        answer = function(owner, *rest, **named)
         # A traced result belongs to one trace only.
-        if is_traced(result):
-            return result
-        for leaf in jax.tree.leaves(result):
+        if is_traced(answer):
+            return answer
+        for leaf in jax.tree.leaves(answer):
             _close(leaf)
         # The weak reference removes the entry when the object is collected.
-        answers[requested] = result
-        results.setdefault(place, (ref(item, lambda _: results.pop(place, None)), answers))
-        return result
+        answers[requested] = answer
+        results.setdefault(identity, (ref(owner, lambda _: results.pop(identity, None)), answers))
+        return answer
 
     return cast(Callable[Concatenate[S, P], T], known)
+
+
+def shared(make: Callable[[S], T]) -> Callable[[S], T]:
+    """Return the function with what it makes of an object shared by all who ask, as long as one of them holds it.
+
+    What is made must hold the object, whose identity is the key.
+    """
+    in_use: WeakValueDictionary[int, T] = WeakValueDictionary()
+
+    @wraps(make, updated=())
+    def once(source: S) -> T:
+        made = in_use.get(id(source))
+        if made is None:
+            made = in_use[id(source)] = make(source)
+        return made
+
+    return once
 
 
 def cached_arrays(function: Callable[P, T]) -> Callable[P, T]:
@@ -60,8 +77,8 @@ def cached_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def copied(*args: P.args, **kwargs: P.kwargs) -> T:
-        result: T = jax.tree.map(np.copy, known(*args, **kwargs))
-        return result
+        arrays: T = jax.tree.map(np.copy, known(*args, **kwargs))
+        return arrays
 
     return copied
 

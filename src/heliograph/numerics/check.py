@@ -1,7 +1,7 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, cast
@@ -34,9 +34,9 @@ class Marked(np.ndarray):
 
 def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
     """Return a copy of an array that calls `report(name, domain)` when it is checked."""
-    result = np.array(value, dtype=np.float64).view(Marked)
-    result.report = report
-    return result
+    copy = np.array(value, dtype=np.float64).view(Marked)
+    copy.report = report
+    return copy
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
@@ -45,9 +45,9 @@ def report_domain(name: str, value: object, whole: Domain, entry: Domain | None 
         if value.report is not None:
             value.report(name, whole)
     elif isinstance(value, list | tuple):
-        for item in value:
-            if isinstance(item, Marked | list | tuple):
-                report_domain(name, item, whole if entry is None else entry, entry)
+        for element in value:
+            if isinstance(element, Marked | list | tuple):
+                report_domain(name, element, whole if entry is None else entry, entry)
 
 
 def report_covariance(name: str, value: object) -> None:
@@ -56,8 +56,8 @@ def report_covariance(name: str, value: object) -> None:
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
         for i, row in enumerate(value):
-            for j, item in enumerate(row if isinstance(row, list | tuple) else []):
-                report_domain(name, item, POSITIVE if i == j else REAL)
+            for j, element in enumerate(row if isinstance(row, list | tuple) else []):
+                report_domain(name, element, POSITIVE if i == j else REAL)
 
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
@@ -103,20 +103,20 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     shape alone is checked.
     """
     report_domain(name, value, REAL)
-    result = _numbers(name, value)
-    matches = result.ndim == len(shape) and all(
+    numbers = _numbers(name, value)
+    matches = numbers.ndim == len(shape) and all(
         not isinstance(projection, int) or projection == have
-        for projection, have in zip(shape, result.shape, strict=True)
+        for projection, have in zip(shape, numbers.shape, strict=True)
     )
     if not matches:
-        raise fail(name, _shape_words(shape, result.ndim), f"shape {result.shape}")
-    if is_traced(result):
-        return result
-    wrong = np.isinf(result) if missing else ~np.isfinite(result)
+        raise fail(name, _shape_words(shape, numbers.ndim), f"shape {numbers.shape}")
+    if is_traced(numbers):
+        return numbers
+    wrong = np.isinf(numbers) if missing else ~np.isfinite(numbers)
     if np.any(wrong):
         got = f"{np.count_nonzero(wrong)} that are not finite"
         raise fail(name, "finite numbers, or NaN for what is missing" if missing else "finite numbers", got)
-    return result
+    return numbers
 
 
 def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
@@ -131,26 +131,26 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
 
 def _numbers(name: str, value: ArrayLike) -> Any:
     try:
-        result = jnp.asarray(value) if is_traced(value) else np.asarray(value)
-        if result.dtype.kind in "US":  # text is no number, though it may read as one
+        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+        if numbers.dtype.kind in "US":  # text is no number, though it may read as one
             raise ValueError
-        known = None if is_traced(value) else result.astype(np.float64 if result.dtype.kind != "c" else complex)
+        known = None if is_traced(value) else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
     except (TypeError, ValueError):
         raise fail(name, "an array of numbers", shown(value)) from None
-    if np.issubdtype(result.dtype, np.complexfloating):
+    if np.issubdtype(numbers.dtype, np.complexfloating):
         raise fail(name, "real numbers", "complex ones")
     if known is not None:
         return known
-    return result if jnp.issubdtype(result.dtype, jnp.floating) else result.astype(float)
+    return numbers if jnp.issubdtype(numbers.dtype, jnp.floating) else numbers.astype(float)
 
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
     """Return `value` as a finite scalar between `low` and `high`."""
     report_domain(name, value, Domain(low=low, high=high))
-    result = array(name, value, ())
-    if not is_traced(result) and not low <= result <= high:
-        raise fail(name, _range_words(low, high), f"{float(result):g}")
-    return result
+    number = array(name, value, ())
+    if not is_traced(number) and not low <= number <= high:
+        raise fail(name, _range_words(low, high), f"{float(number):g}")
+    return number
 
 
 def _range_words(low: float, high: float) -> str:
@@ -176,6 +176,15 @@ def table(name: str, value: object, what: str) -> dict[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise fail(name, f"a dictionary of {what} by name", shown(value))
     return dict(value)
+
+
+def of_each(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
+    """Return one value for each name, from a value for all of them or a dictionary of just these names."""
+    if not isinstance(value, Mapping):
+        return [value] * len(names)
+    if set(value) != set(names):
+        raise fail(name, f"one for each {whom} of {list(names)[:5]}", f"others: {sorted(set(value) ^ set(names))[:3]}")
+    return [value[key] for key in names]
 
 
 def instance(name: str, value: object, kind: type[T], what: str) -> T:
@@ -225,8 +234,8 @@ def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
         single = np.ndim(value) == 0
     except ValueError:  # rows of different lengths
         single = False
-    result: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
-    return result
+    numbers: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
+    return numbers
 
 
 def check_count(name: str, value: object, least: int = 1) -> int:
@@ -272,8 +281,8 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def backwards(clock: np.ndarray) -> int | None:
     """Return the first row whose time is before that of the row above, None if there is none."""
-    result = np.flatnonzero(clock[1:] < clock[:-1])
-    return int(result[0]) + 1 if result.size else None
+    falls = np.flatnonzero(clock[1:] < clock[:-1])
+    return int(falls[0]) + 1 if falls.size else None
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
@@ -285,24 +294,24 @@ def backwards_text(clock: np.ndarray, row: int) -> str:
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
     """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
     report_covariance(name, value)
-    result = _numbers(name, value)
+    matrix = _numbers(name, value)
     # A scalar c stands for c I.
-    if dimension is not None and result.ndim == 0:
-        result = array(name, result, ()) * np.eye(dimension)
-    result = array(name, result, (dimension, dimension))
-    if result.shape[0] != result.shape[1]:
-        raise fail(name, "a square matrix", f"shape {result.shape}")
-    if is_traced(result):
-        return (result + result.T) / 2
+    if dimension is not None and matrix.ndim == 0:
+        matrix = array(name, matrix, ()) * np.eye(dimension)
+    matrix = array(name, matrix, (dimension, dimension))
+    if matrix.shape[0] != matrix.shape[1]:
+        raise fail(name, "a square matrix", f"shape {matrix.shape}")
+    if is_traced(matrix):
+        return (matrix + matrix.T) / 2
     # Symmetry and definiteness are judged of correlations, so that neither depends on units.
-    unit = standard_deviations(result)
-    skew = np.abs(result - result.T)
+    unit = standard_deviations(matrix)
+    skew = np.abs(matrix - matrix.T)
     if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
         raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
-    smallest = np.min(np.linalg.eigvalsh(result / np.outer(unit, unit)), initial=np.inf)
+    smallest = np.min(np.linalg.eigvalsh(matrix / np.outer(unit, unit)), initial=np.inf)
     if smallest < -DEFINITENESS_TOLERANCE:
-        raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(result)[0]:.3g}")
-    return (result + result.T) / 2
+        raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(matrix)[0]:.3g}")
+    return (matrix + matrix.T) / 2
 
 
 def standard_deviations(matrix: np.ndarray) -> np.ndarray:
@@ -319,14 +328,14 @@ def standard_deviations(matrix: np.ndarray) -> np.ndarray:
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
     """Return non-negative numbers that sum to one."""
     report_domain(name, value, SIMPLEX, PROBABILITY)
-    result = array(name, value, (count,))
-    if is_traced(result):
-        return result
-    if np.any(result < 0):
-        raise fail(name, "no negative probability", result.tolist())
-    if abs(result.sum() - 1) > PROBABILITY_TOLERANCE:
-        raise fail(name, "probabilities that sum to 1", f"{result.tolist()} with sum {result.sum():.10g}")
-    return result
+    chances = array(name, value, (count,))
+    if is_traced(chances):
+        return chances
+    if np.any(chances < 0):
+        raise fail(name, "no negative probability", chances.tolist())
+    if abs(chances.sum() - 1) > PROBABILITY_TOLERANCE:
+        raise fail(name, "probabilities that sum to 1", f"{chances.tolist()} with sum {chances.sum():.10g}")
+    return chances
 
 
 def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
@@ -335,10 +344,10 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     A radius above max(p, 1 - p) is refused: no probability could ever move that far. Which corners a radius leaves is
     read off the numbers, so that neither it nor, where it is positive, the probabilities can be traced.
     """
-    result = _numbers(name, value)
-    if is_traced(result):
+    numbers = _numbers(name, value)
+    if is_traced(numbers):
         raise fail(name, "a number, since the corners of what is possible depend on it", "a traced one")
-    radius: np.ndarray = array(name, np.full(nominal.shape, result) if result.ndim == 0 else result, nominal.shape)
+    radius: np.ndarray = array(name, np.full(nominal.shape, numbers) if numbers.ndim == 0 else numbers, nominal.shape)
     if is_traced(nominal):
         if np.any(radius > 0):
             raise fail(name, "zero, where the probabilities are traced", radius.tolist())
@@ -360,7 +369,7 @@ def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str,
     """Return `count` distinct names; None gives prefix0, prefix1, ...; a mapping gives each name its unit."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
-    result = tuple(name_list(name, value))
-    if len(result) != count or len(set(result)) != count:
-        raise fail(name, f"{count} distinct names", shown(list(result)))
-    return result
+    distinct = tuple(name_list(name, value))
+    if len(distinct) != count or len(set(distinct)) != count:
+        raise fail(name, f"{count} distinct names", shown(list(distinct)))
+    return distinct

@@ -52,15 +52,15 @@ def _instant(match: re.Match[str]) -> int:
     """Nanoseconds since 1970 in UTC."""
     if int(match["day"][:4]) not in YEARS:
         raise ValueError
-    local = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
+    nanoseconds = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
     zone = match["zone"] or "Z"
     if zone in ("Z", "UTC"):
-        return local
+        return nanoseconds
     hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
     if hours > 23 or minutes > 59:
         raise ValueError
     ahead = (60 * hours + minutes) * 60 * 10**9
-    return local - ahead if zone[0] == "+" else local + ahead
+    return nanoseconds - ahead if zone[0] == "+" else nanoseconds + ahead
 
 
 def instant(text: str) -> datetime:

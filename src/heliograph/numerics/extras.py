@@ -40,5 +40,5 @@ EXTRAS = {  # the extra that brings a package which the core does without
 def how_to_install(extra: str) -> str:
     """A command that brings an extra to this Python, also from a clone, whose name no index knows."""
     clone = Path(heliograph.__file__).parents[2]
-    place = clone if (clone / "pyproject.toml").is_file() else "heliograph"
-    return f'{sys.executable} -m pip install "{place}[{extra}]"'
+    package = clone if (clone / "pyproject.toml").is_file() else "heliograph"
+    return f'{sys.executable} -m pip install "{package}[{extra}]"'

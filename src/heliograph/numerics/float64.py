@@ -54,8 +54,8 @@ def _compiled(function: Callable[P, R], options: Callable[[], Options], donate: 
 
     @cache
     def jitted() -> Callable[P, R]:
-        result: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=options())  # type: ignore[call-overload]
-        return result
+        program: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=options())  # type: ignore[call-overload]
+        return program
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -98,6 +98,9 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan (which may
     have chosen single precision).
+
+    Args:
+        function: of arrays or model objects; its results too.
     """
 
     @wraps(function)
@@ -106,8 +109,8 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
-            result: R = to_numpy(function(*args, **kwargs))
-        return result
+            arrays: R = to_numpy(function(*args, **kwargs))
+        return arrays
 
     return scoped
 
@@ -126,8 +129,8 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
-            result: R = to_numpy(jitted(*jax.tree.map(_as_array, args), **jax.tree.map(_as_array, kwargs)))
-        return result
+            arrays: R = to_numpy(jitted(*jax.tree.map(_as_array, args), **jax.tree.map(_as_array, kwargs)))
+        return arrays
 
     return call
 
@@ -137,7 +140,7 @@ def _traced(tree: PyTree) -> bool:
 
 
 def _as_array(leaf: object) -> object:
-    result = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
-    if isinstance(result, np.ndarray) and result.dtype.kind in "OUS":
+    value = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
+    if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":
         raise fail("argument", "numbers that a double can hold", shown(leaf))
-    return result
+    return value

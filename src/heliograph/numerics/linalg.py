@@ -147,8 +147,8 @@ def sum_of_squares(
 @jax.custom_jvp
 def spread_of(gain: jax.Array, noise: jax.Array) -> jax.Array:
     """K N K' of a positive semidefinite N as a square, by a root of N; its derivatives are those of the product."""
-    part = times(gain, root(noise))
-    return times(part, transpose(part))
+    half = times(gain, root(noise))
+    return times(half, transpose(half))
 
 
 @spread_of.defjvp
@@ -236,10 +236,10 @@ def long_factor(a: jax.Array) -> jax.Array:
         # a: the Schur complement of the pivot.
         return a - jnp.outer(column, column), done.at[:, j].set(column), jnp.maximum(growth, whole[j] * scale * scale)
 
-    result: jax.Array = jax.lax.fori_loop(
-        0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a), jnp.zeros_like(a[0, 0]))
-    )[1]
-    return result
+    lower: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a), jnp.zeros_like(a[0, 0])))[
+        1
+    ]
+    return lower
 
 
 def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -15,47 +15,47 @@ import numpy as np
 from heliograph.numerics.names import refuse_attribute
 
 
-def same(item: Any, other: Any) -> bool:
+def same(x: Any, y: Any) -> bool:
     """Return one bool for objects that hold arrays: of the same class, and the same in each part.
 
     Arrays are the same if their shape, kind of number and numbers are; NaN is the same as NaN. A traced array is the
     same as itself alone.
     """
-    if item is other:
+    if x is y:
         return True
-    if isinstance(item, jax.core.Tracer) or isinstance(other, jax.core.Tracer):
+    if isinstance(x, jax.core.Tracer) or isinstance(y, jax.core.Tracer):
         return False
-    if isinstance(item, np.ndarray | np.generic | jax.Array) and isinstance(other, np.ndarray | np.generic | jax.Array):
-        return _same_array(item, other)
-    if type(item) is not type(other):
+    if isinstance(x, np.ndarray | np.generic | jax.Array) and isinstance(y, np.ndarray | np.generic | jax.Array):
+        return _same_array(x, y)
+    if type(x) is not type(y):
         return False
     # Containers and dataclasses, part by part.
-    if isinstance(item, Mapping):
-        return item.keys() == other.keys() and all(same(item[key], other[key]) for key in item) and _rest(item, other)
-    if isinstance(item, tuple | list):
-        return len(item) == len(other) and all(map(same, item, other))
-    if isinstance(item, partial):
-        return same((item.func, item.args, item.keywords), (other.func, other.args, other.keywords))
-    if is_dataclass(item):
-        return all(same(getattr(item, f.name, None), getattr(other, f.name, None)) for f in fields(item) if f.compare)
+    if isinstance(x, Mapping):
+        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x) and _rest(x, y)
+    if isinstance(x, tuple | list):
+        return len(x) == len(y) and all(map(same, x, y))
+    if isinstance(x, partial):
+        return same((x.func, x.args, x.keywords), (y.func, y.args, y.keywords))
+    if is_dataclass(x):
+        return all(same(getattr(x, f.name, None), getattr(y, f.name, None)) for f in fields(x) if f.compare)
     # Objects without an equality of their class are compared by their attributes.
-    kind: Any = type(item)
-    if kind.__eq__ is object.__eq__ and not callable(item) and getattr(item, "__dict__", None):
-        return same(vars(item), vars(other))  # nobody has said when two of these are equal
-    return bool(item == other) or (isinstance(item, float) and item != item and other != other)
+    kind: Any = type(x)
+    if kind.__eq__ is object.__eq__ and not callable(x) and getattr(x, "__dict__", None):
+        return same(vars(x), vars(y))  # nobody has said when two of these are equal
+    return bool(x == y) or (isinstance(x, float) and x != x and y != y)
 
 
-def _rest(item: object, other: object) -> bool:
+def _rest(x: object, y: object) -> bool:
     """Compare the attributes that a subclass of dict has in addition to its entries."""
-    return same(getattr(item, "__dict__", None), getattr(other, "__dict__", None))
+    return same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
 
 
-def _same_array(item: Any, other: Any) -> bool:
-    if item.shape != other.shape or item.dtype != other.dtype:
+def _same_array(value: Any, other: Any) -> bool:
+    if value.shape != other.shape or value.dtype != other.dtype:
         return False
-    if jnp.issubdtype(item.dtype, jax.dtypes.prng_key):
-        item, other = jax.random.key_data(item), jax.random.key_data(other)
-    a, b = np.asarray(item), np.asarray(other)
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        value, other = jax.random.key_data(value), jax.random.key_data(other)
+    a, b = np.asarray(value), np.asarray(other)
     return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))
 
 
@@ -97,7 +97,7 @@ def _repr(self: object) -> str:
     parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_parts(self), LINES - 2)]
     left = sum(1 for _ in _parts(self)) - len(parts)
     more = [f"  … {left} more"] if left else []
-    return "\n".join([f"{type(self).__name__}(", *(cut(part) for part in (*parts, *more)), ")"])
+    return "\n".join([f"{type(self).__name__}(", *(cut(text) for text in (*parts, *more)), ")"])
 
 
 def _html(self: object) -> str:
@@ -119,11 +119,11 @@ def line(value: object, depth: int) -> str:
     # Containers, item by item.
     if isinstance(value, Mapping) and not _ours(value):
         return _joined(
-            "{", value.items(), len(value), depth, lambda item: f"{item[0]!r}: {line(item[1], depth - 1)}", "}"
+            "{", value.items(), len(value), depth, lambda pair: f"{pair[0]!r}: {line(pair[1], depth - 1)}", "}"
         )
     if isinstance(value, tuple | list) and not _ours(value):
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
-        return _joined(marks[0], value, len(value), depth, lambda item: line(item, depth - 1), marks[1])
+        return _joined(marks[0], value, len(value), depth, lambda entry: line(entry, depth - 1), marks[1])
     # Objects with fields.
     if _ours(value) or is_dataclass(value):
         name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
@@ -142,12 +142,12 @@ def _ours(value: object) -> bool:
 def _parts(value: object) -> Iterable[tuple[str, object]]:
     """Names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
-        return ((repr(key), item) for key, item in value.items())
+        return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):
         named = ((field.name, getattr(value, field.name, None)) for field in fields(value))
     else:
         named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
-    return ((name, item) for name, item in named if not name.startswith("_"))
+    return ((name, entry) for name, entry in named if not name.startswith("_"))
 
 
 def _array(value: np.ndarray | np.generic | jax.Array) -> str:
@@ -176,14 +176,14 @@ def cut(text: str) -> str:
 
 
 def _table(value: object, depth: int) -> str:
-    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(item, depth - 1)}</td></tr>" for name, item in _entries(value)]
+    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(entry, depth - 1)}</td></tr>" for name, entry in _entries(value)]
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
 
 def _entries(value: object) -> Iterable[tuple[str, object]]:
-    result = _parts(value)
-    yield from islice(result, LARGE)
-    left = sum(1 for _ in result)
+    entries = _parts(value)
+    yield from islice(entries, LARGE)
+    left = sum(1 for _ in entries)
     if left:
         yield "…", f"{left} more"
 

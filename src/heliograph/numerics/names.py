@@ -30,15 +30,15 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
     return attribute, listed, names
 
 
-def refuse_attribute(item: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
+def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
     """Refuse an attribute that an object does not have, with what to write instead, or the names most like it.
 
     What stands in `remedies`, by name, comes first, then a function of heliograph that has the name.
     """
-    kind = type(item)
+    kind = type(owner)
     if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
-        object.__getattribute__(item, name)
-    public = {other: other for other in object.__dir__(item) if not other.startswith("_")}
+        object.__getattribute__(owner, name)
+    public = {other: other for other in object.__dir__(owner) if not other.startswith("_")}
     remedy = offered(name, public)
     if not remedy and name in import_module("heliograph").__all__:
         remedy = f"; write hg.{name}(...)"
@@ -56,12 +56,12 @@ def offered(name: str, known: Mapping[str, str]) -> str:
 def closest(name: str, known: Mapping[str, str]) -> list[str]:
     """Return what stands for the known names most like a name, the nearest first; capitals and _ count for nothing."""
     plain: dict[str, str] = {}
-    for item, shown in known.items():
-        plain.setdefault(_plain(item), shown)
-    meant = [item for item in plain if item == MEANT.get(_plain(name))]
+    for public, shown in known.items():
+        plain.setdefault(_plain(public), shown)
+    meant = [candidate for candidate in plain if candidate == MEANT.get(_plain(name))]
     alike = get_close_matches(_plain(name), plain, MOST, ALIKE)
-    around = [item for item in plain if len(name) > 2 and _plain(name) in item]  # kalman: kalman_filter
-    return [plain[item] for item in dict.fromkeys([*meant, *alike, *around])][:MOST]
+    around = [candidate for candidate in plain if len(name) > 2 and _plain(name) in candidate]  # kalman: kalman_filter
+    return [plain[candidate] for candidate in dict.fromkeys([*meant, *alike, *around])][:MOST]
 
 
 def _plain(name: str) -> str:

@@ -54,16 +54,16 @@ def runs_last(
         leaves = [jnp.asarray(leaf) for leaf in leaves]
         # Shapes and types of the results, by tracing where they are not stated.
         if shapes is None:
-            item = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
+            like = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
         else:
-            item = _said(shapes(*args, **kwargs), leaves)
-        declared, form = jax.tree.flatten(item)
+            like = _said(shapes(*args, **kwargs), leaves)
+        declared, form = jax.tree.flatten(like)
         sizes = tuple((x.shape, x.dtype) for x in declared)
         x64 = bool(jnp.result_type(float) == np.float64)
         # One primitive, so that its batching rule can move the mapped axis last.
         results = _kernel.bind(*leaves, kernel=this, tree=tree, declared=sizes, x64=x64, runs=())
-        result: R = jax.tree.unflatten(form, results)
-        return result
+        arranged: R = jax.tree.unflatten(form, results)
+        return arranged
 
     return call
 
@@ -136,7 +136,7 @@ def _with_tangents(
         args, kwargs = jax.tree.unflatten(tree, [next(items) if m else x for m, x in zip(moves, primals, strict=True)])
         return _for_each(jax.tree.leaves(kernel.source(*args, **kwargs)), declared, runs)
 
-    at, along = (tuple(x for m, x in zip(moves, part, strict=True) if m) for part in (primals, tangents))
+    at, along = (tuple(x for m, x in zip(moves, values, strict=True) if m) for values in (primals, tangents))
     results, slopes = jax.jvp(source, at, along)
     return results, slopes
 
@@ -176,11 +176,11 @@ class Pick(Protocol):
 
 def where_any(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
     """`costly` for runs that need it and `cheap` for the others; `costly` is computed only where any run needs it."""
-    result: R = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
-    return result
+    chosen: R = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
+    return chosen
 
 
 def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
     """The same by computing both."""
-    result: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
-    return result
+    chosen: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
+    return chosen

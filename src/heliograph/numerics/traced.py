@@ -38,14 +38,14 @@ def scipy_for(*values: object) -> Any:
 
 def plain(value: Any) -> float | jax.Array:
     """Return a known number as a Python float, a traced one unchanged."""
-    result: float | jax.Array = value if is_traced(value) else float(value)
-    return result
+    number: float | jax.Array = value if is_traced(value) else float(value)
+    return number
 
 
 def stacked(parts: Sequence[object]) -> jax.Array | np.ndarray:
     """Stack numbers or arrays of one shape along a new first axis."""
-    result: jax.Array | np.ndarray = library(parts).stack(parts)
-    return result
+    array: jax.Array | np.ndarray = library(parts).stack(parts)
+    return array
 
 
 def is_zero(value: Any) -> bool:
@@ -60,6 +60,6 @@ def placed(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.nd
     """
     if is_traced(values):
         return jnp.zeros(size).at[places].add(values)
-    result = np.zeros(size)
-    np.add.at(result, places, values)
-    return result
+    table = np.zeros(size)
+    np.add.at(table, places, values)
+    return table

@@ -38,9 +38,9 @@ class NameWithUnit(str):
 
     def __new__(cls, name: str, unit: str) -> "NameWithUnit":
         """Make the name, with its unit."""
-        result = super().__new__(cls, name)
-        result.unit = unit
-        return result
+        named = super().__new__(cls, name)
+        named.unit = unit
+        return named
 
     def __reduce__(self) -> tuple[type["NameWithUnit"], tuple[str, str]]:
         """Return what a copy in another process is made from."""

@@ -80,7 +80,7 @@ class PowerLimits(NamedTuple):
 
     def best(self, gain: Powers) -> Powers:
         """Find the allowed powers q with the largest <gain, q>, zero where no gain is: limits are nested, so a sort."""
-        result, steps = np.zeros_like(gain), len(gain)
+        powers, steps = np.zeros_like(gain), len(gain)
         left, mean = self.total * steps, self.mean * steps
         for flat in np.argsort(-gain, axis=None, kind="stable"):
             k, h = np.unravel_index(flat, gain.shape)
@@ -88,10 +88,10 @@ class PowerLimits(NamedTuple):
                 break
             if not np.isfinite(power := min(float(self.peak[k, h]), float(mean[h]), left)):
                 raise fail("budget", "one that limits every transmitter that helps", "no limit")
-            result[k, h] = power
+            powers[k, h] = power
             mean[h] -= power
             left -= power
-        return result
+        return powers
 
     def even(self, on: Bool[np.ndarray, "time free"]) -> Powers:
         """Largest allowed powers that are equal wherever `on` and no narrower limit binds."""

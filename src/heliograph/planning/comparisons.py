@@ -48,7 +48,7 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
     Args:
         problem: the design problem; its other limits of power stay.
         totals: total powers, shape (points,), positive.
-        advance: called with a word before each design.
+        advance: called with a word before each design (by default nothing is).
 
     Returns:
         totals in rising order, errors, and bounds below which no error is, each of shape (points,).
@@ -102,7 +102,7 @@ def error_over_sites(
         build: function that returns the network for a place (x, y).
         x: places, shape (columns,).
         y: places, shape (rows,).
-        advance: called with a word before each row.
+        advance: called with a word before each row (by default nothing is).
 
     Returns:
         x, y, the errors at all places, shape (rows, columns), and the best place.
@@ -147,7 +147,7 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
     Args:
         best: the design of a network.
         exponent: exponent of the path loss; relays are not tried without.
-        advance: called with a word before each design.
+        advance: called with a word before each design (by default nothing is).
 
     Returns:
         Changes by name, with the value of the design and what it saves, the most first.
@@ -158,12 +158,12 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
     instance("design", best, PowerDesign, "a PowerDesign")
     network = instance("network of the design", best.problem.network, Network, "a Network")
     problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
-    result = []
+    worths = []
     for name, changed in _changes(problem, network, exponent).items():
         advance(name)
         value = design(changed).certificate.value
-        result.append(ChangeWorth(name, value, best.certificate.value - value))
-    return sorted(result, key=lambda change: -change.saved)
+        worths.append(ChangeWorth(name, value, best.certificate.value - value))
+    return sorted(worths, key=lambda change: -change.saved)
 
 
 def _changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
@@ -175,21 +175,21 @@ def _changes(problem: DesignProblem, network: Network, exponent: float | None) -
     def with_nodes(changed: dict[str, Node], names: tuple[str, ...] | None) -> DesignProblem:
         return replace(problem, network=Network(network.plant, changed), free=names)
 
-    result = {}
+    changed = {}
     for name, node in bare.items():
         twin = f"{name} again"
-        result[f"one more {name}"] = with_nodes({**bare, twin: node}, None if free is None else (*free, twin))
-        rest = None if free is None else tuple(part for part in free if _node(part) != name)
+        changed[f"one more {name}"] = with_nodes({**bare, twin: node}, None if free is None else (*free, twin))
+        rest = None if free is None else tuple(free_name for free_name in free if _node(free_name) != name)
         if len(bare) > 1 and rest != () and problem.target_error is None:
-            left = {other: item for other, item in bare.items() if other != name}
-            result[f"without {name}"] = with_nodes(left, rest)
+            left = {other: node_left for other, node_left in bare.items() if other != name}
+            changed[f"without {name}"] = with_nodes(left, rest)
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
             # Hops are counted anew behind a relay that is put between: nodes are free as a whole.
-            whole = None if free is None else tuple(dict.fromkeys(_node(part) for part in free))
+            whole = None if free is None else tuple(dict.fromkeys(_node(free_name) for free_name in free))
             for hop in transmitter_names(node.channel):
                 nearer = Node(node.sensor, _halfway(node.channel, hop, exponent), {})
-                result[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
-    return result
+                changed[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
+    return changed
 
 
 def _node(transmitter: str) -> str:

@@ -135,9 +135,9 @@ class Programme:
         constraints: list[NonlinearConstraint],
         tolerance: float,
     ) -> Vector:
-        result = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
+        optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
                           options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
-        end = np.clip(result.x, self.bounds.lb, self.bounds.ub)
+        end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
         unit = self.problem.unit
         return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
 
@@ -181,9 +181,9 @@ class Programme:
             return np.asarray((self.value(at)[1] - multipliers @ self.room_slope(at)[active])[index] * scale)
 
         here, hessian = lagrangian(z), np.empty((len(index), len(index)))
-        for column, place in enumerate(index):
+        for column, variable in enumerate(index):
             shift = np.zeros_like(z)
-            shift[place] = SHIFT * scale[column]
+            shift[variable] = SHIFT * scale[column]
             hessian[:, column] = (lagrangian(z + shift) - here) / SHIFT
         # The equations of Karush, Kuhn and Tucker on the active limits.
         system = np.block([[(hessian + hessian.T) / 2, -face.T], [face, np.zeros((len(face), len(face)))]])

@@ -81,17 +81,17 @@ def simulated_rate(
         sensor: the sensor.
         channel: the link, with its losses.
         trigger: the sender's rule.
-        runs: number of simulated runs.
-        horizon: steps of a run.
-        seed: seed of the draws.
+        runs: number of simulated runs (default 64).
+        horizon: steps of a run (default 400).
+        seed: seed of the draws (default 0).
 
     Raises:
         ValueError: parts that do not fit; counts below 2 runs and 4 steps.
     """
     check_count("runs", runs, 2)
     check_count("horizon", horizon, 4)
-    item = event_filter(plant, sensor, channel, trigger)
-    node = Node(sensor, channel, {"event": item}, trigger=trigger)
+    filter = event_filter(plant, sensor, channel, trigger)
+    node = Node(sensor, channel, {"event": filter}, trigger=trigger)
     record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
     sent = record.transmissions["sender"][:, horizon // 4 :] != 0
     by_run = sent.mean(axis=(1, 2))
@@ -112,6 +112,12 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
 
     visits in silence from one arrival to the next: v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de), kappa = 1 within
     delta, `loss` beyond; rate (1 + int_{|e| > delta} v) / T and error P + int e^2 v / T, T = 1 + int v. Exact.
+
+    Args:
+        plant: of one state.
+        sensor: of one output.
+        delta: distance beyond which is sent, in the unit of the state.
+        loss: probability that a transmission is lost (default 0).
 
     Raises:
         ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
@@ -152,7 +158,7 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
         plant: a linear plant of one state.
         sensor: a linear sensor of one output.
         rate: transmissions a step.
-        loss: probability that a transmission is lost.
+        loss: probability that a transmission is lost (default 0).
 
     Raises:
         ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
@@ -166,6 +172,11 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 
     From the stationary law of (x, r), r the reference, as a Markov chain on two grids of cells, extrapolated: to 1e-3
     of itself where one step in a hundred sends, to 1 % at one in 2,500.
+
+    Args:
+        plant: of one state, stable.
+        sensor: of one output.
+        delta: distance from the value sent last beyond which is sent, in the unit of y.
 
     Raises:
         ValueError: a plant or sensor of more than one state and output; a plant that is not stable; a delta so large

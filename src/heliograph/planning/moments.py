@@ -109,14 +109,14 @@ def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
     mean: Any = start.initial_mean
     spread: Any = start.initial_covariance
     u = np.zeros((horizon, len(start.inputs))) if inputs is None else np.asarray(inputs)
-    result = []
+    seconds = []
     for k in range(horizon):
         now = at(plant, k)
         noise_mean, noise = _noise(now, u[k])
         mean = now.matrix @ mean + now.input_matrix @ u[k] + noise_mean
         spread = now.matrix @ spread @ now.matrix.T + noise
-        result.append(_second_moment(mean, spread))
-    return result
+        seconds.append(_second_moment(mean, spread))
+    return seconds
 
 
 def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:

@@ -57,10 +57,12 @@ def design(
             others of that node), all unless given; the others keep their power. Of a function {name: (start, low,
             high)}, or none where `hg.free` marks the numbers in it.
         error: the error that is to be small; the steady trace unless given.
-        budget: the total mean power, or a `Budget`; of relays that filter, what all together may send in each slot.
-        target_error: an error; then the least total mean power is sought that reaches it, within the budget if any.
-        starts: number of descents, where the problem is not convex.
-        seed: of the starts that are drawn.
+        budget: the total mean power, or a `Budget`; of relays that filter, what all together may send in each slot
+            (default none).
+        target_error: an error; then the least total mean power is sought that reaches it, within the budget if any
+            (default none).
+        starts: number of descents, where the problem is not convex (default 64).
+        seed: of the starts that are drawn (default 0).
 
     Returns:
         The design, with its certificate.
@@ -77,14 +79,16 @@ def design(
         problem = network
     if problem.error is not None:
         instance("error", problem.error, Error, "an Error")
-    item = problem.network
-    if isinstance(item, RelayNetwork):
-        return design_relays(problem, item)
-    if isinstance(item, Network | Paths):
+    # One way for each kind of network.
+    designable = problem.network
+    if isinstance(designable, RelayNetwork):
+        return design_relays(problem, designable)
+    if isinstance(designable, Network | Paths):
         return _design_powers(problem)
-    if callable(item):
-        return design_numbers(problem, item)
-    raise fail("network", "a Network, a RelayNetwork, Paths or a function that returns a Network", type(item).__name__)
+    if callable(designable):
+        return design_numbers(problem, designable)
+    expected = "a Network, a RelayNetwork, Paths or a function that returns a Network"
+    raise fail("network", expected, type(designable).__name__)
 
 
 def _design_powers(problem: DesignProblem) -> PowerDesign:
@@ -96,14 +100,15 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         raise fail("free", expected, shown(problem.free))
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
-    error, item = problem.criterion, problem.network
+    error, network = problem.criterion, problem.network
     # Paths, and what is sent at present.
-    if isinstance(item, Network):
-        paths, fixed = paths_of(item, error)
-        states = item.states
+    if isinstance(network, Network):
+        paths, fixed = paths_of(network, error)
+        states = network.states
     else:
-        assert isinstance(item, Paths)
-        paths, fixed, states = item, np.zeros(item.kappa.shape), tuple(f"x{i}" for i in range(item.rows.shape[-1]))
+        assert isinstance(network, Paths)
+        paths, fixed = network, np.zeros(network.kappa.shape)
+        states = tuple(f"x{i}" for i in range(network.rows.shape[-1]))
         if error.steps != len(paths.kappa) or (error.horizon is None) != (paths.plants.start is None):
             raise fail("error", f"that over {len(paths.kappa)} steps for which the paths were made", f"{error.steps}")
         if problem.free is not None:
@@ -116,7 +121,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         limits = power_limits(as_budget(problem.budget), paths.names, chosen, fixed)
     criterion = error.criterion(states)
     task = power_task(paths, criterion, limits, chosen, fixed, starts, seed)
-    present = task.problem.exact(fixed[:, chosen]) if isinstance(item, Network) else float("nan")
+    present = task.problem.exact(fixed[:, chosen]) if isinstance(network, Network) else float("nan")
     return design_paths(problem, task, target, present)
 
 
@@ -155,8 +160,8 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         raise fail("budget of relays that filter", "a total for each slot", "other limits")
     # Errors of the designed gains, and of those that minimise each relay's error.
     gains = periodic_relays_for_best_receiver(relays, power_limit=None if limits is None else limits.total)
-    local = periodic_local_error_design(relays).gains
-    spread, before = (periodic_behind_relays(relays, design) for design in (gains, local))
+    local_gains = periodic_local_error_design(relays).gains
+    spread, before = (periodic_behind_relays(relays, design) for design in (gains, local_gains))
     value, present = (float(np.trace(design, axis1=1, axis2=2).mean()) for design in (spread, before))
     # What relays and sensor send.
     slots, n = len(relays.slots), len(relays.states)

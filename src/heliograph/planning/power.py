@@ -81,8 +81,8 @@ def power(
         network: the network.
         horizon: number of steps from the plant's initial law on; the steady state of a linear plant unless given.
         inputs: inputs of the plant, (horizon, inputs); zero unless given.
-        runs: number of drawn trajectories, where plant or sensors are not linear.
-        seed: of the draws.
+        runs: number of drawn trajectories, where plant or sensors are not linear (default 1000).
+        seed: of the draws (default 0).
 
     Returns:
         The powers, with standard errors where they are drawn.
@@ -115,8 +115,8 @@ def power(
         raise fail("power", "a horizon, since plant or sensor is not linear", "none")
     else:
         y = _drawn(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
-    for name, item in _feedback_filters(network).items():
-        y[name], rate = _innovation_moments(item, u, horizon), float("nan")
+    for name, filter in _feedback_filters(network).items():
+        y[name], rate = _innovation_moments(filter, u, horizon), float("nan")
     # What the hops make of it.
     power, error = {}, {}
     for name, (_, channel) in sources.items():
@@ -203,8 +203,8 @@ def _drawn_moments(
     def run(key: jax.Array) -> dict[str, jax.Array]:
         begin, rest = jax.random.split(key)
 
-        def step(x: jax.Array, item: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-            k, u = item
+        def step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
+            k, u = row
             moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
             # The state moves, then every sensor measures it.
             now = at(plant, k)
@@ -217,8 +217,8 @@ def _drawn_moments(
             return x, moments
 
         start = at(plant, 0).sample_initial(begin)
-        result: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
-        return result
+        over_time: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+        return over_time
 
     runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
     return jax.tree.map(lambda moments: moments.mean(axis=1), runs)  # type: ignore[no-any-return]

@@ -83,19 +83,19 @@ def repeated(network: Network) -> Network:
         times = -(-COVERED // leaf.steps)
         return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
 
-    result: Network = jax.tree.map(again, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
-    return result
+    covered: Network = jax.tree.map(again, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+    return covered
 
 
 def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
     """Powers by transmitter, of all steps."""
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
-    result = table("powers of a network", powers, "powers")
-    if unknown := sorted(set(result) - known):
+    given = table("powers of a network", powers, "powers")
+    if unknown := sorted(set(given) - known):
         raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
     return {
         name: at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
-        for name, power in result.items()
+        for name, power in given.items()
     }
 
 

@@ -40,8 +40,8 @@ class Signal(NamedTuple):
 Visit = Callable[[str, AbstractHop, Signal | None], AbstractRandomAffine]
 
 
-class Place(NamedTuple):
-    """Place in a channel: the prefix of names, the number of hops before it along the chain, and the signal there."""
+class Position(NamedTuple):
+    """Position in a channel: prefix of names, number of hops before it along the chain, and the signal there."""
 
     prefix: str
     hops: int
@@ -73,64 +73,71 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    return _visit(channel, visit, Place("", 0, signal))[0]
+    return _visit(channel, visit, Position("", 0, signal))[0]
 
 
-def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
-    """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
+def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
+    """The changed channel, and the position behind it; its signal is set by the series that the channel is in."""
     match channel:
         # A hop that transmits is visited; a wire is not.
         case AbstractHop():
             if not transmits(channel):
-                return channel, place
-            after = place._replace(hops=place.hops + 1)
-            return visit(f"{place.prefix}hop{after.hops}", channel, place.signal), after
+                return channel, position
+            after = position._replace(hops=position.hops + 1)
+            return visit(f"{position.prefix}hop{after.hops}", channel, position.signal), after
         case Series():
-            visited, place = _visit_chain(channel.maps, visit, place)
+            visited, position = _visit_chain(channel.maps, visit, position)
         case Stack():
-            places = [Place(f"{place.prefix}part{i}.", 0, place.signal) for i in range(1, len(channel.maps) + 1)]
-            visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, places, strict=True)]
+            prefixes = [f"{position.prefix}part{i}." for i in range(1, len(channel.maps) + 1)]
+            positions = [Position(prefix, 0, position.signal) for prefix in prefixes]
+            visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, positions, strict=True)]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
-            several = isinstance(channel, Mixture) and sum(not is_silent(part) for part in channel.maps) > 1
-            prefixes = [f"{place.prefix}choice{i}." for i in range(1, len(channel.maps) + 1)]
-            places = [Place(prefix, 0, place.signal) if several else place for prefix in prefixes]
-            pairs = [_visit(part, visit, at) for part, at in zip(channel.maps, places, strict=True)]
-            visited = [part for part, _ in pairs]
-            place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
+            several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in channel.maps) > 1
+            prefixes = [f"{position.prefix}choice{i}." for i in range(1, len(channel.maps) + 1)]
+            positions = [Position(prefix, 0, position.signal) if several else position for prefix in prefixes]
+            pairs = [_visit(affine, visit, at) for affine, at in zip(channel.maps, positions, strict=True)]
+            visited = [affine for affine, _ in pairs]
+            position = position if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
-            return channel, place
+            return channel, position
         # What wraps a link: inside it.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
-            name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
-            inside = place
-            if isinstance(channel, OfLine) and place.signal is not None:
-                line = _line(place.signal.second, channel.inputs // sent(channel))
-                inside = place._replace(signal=place.signal._replace(second=line))
-            inner, place = _visit(getattr(channel, name), visit, inside)
-            if inner is getattr(channel, name):
-                return channel, place
-            return eqx.tree_at(lambda c: getattr(c, name), channel, inner), place
+            return _visit_inside(channel, visit, position)
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
     # The same object where nothing has changed.
-    if all(part is before for part, before in zip(visited, channel.maps, strict=True)):
-        return channel, place
-    return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), place
+    if all(changed is before for changed, before in zip(visited, channel.maps, strict=True)):
+        return channel, position
+    return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), position
+
+
+def _visit_inside(
+    channel: AbstractRandomAffine, visit: Visit, position: Position
+) -> tuple[AbstractRandomAffine, Position]:
+    """The changed channel around a link, which a line of past signals goes into where the channel is of such a line."""
+    name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
+    if isinstance(channel, OfLine) and position.signal is not None:
+        line = _line(position.signal.second, channel.inputs // sent(channel))
+        position = position._replace(signal=position.signal._replace(second=line))
+    inner, position = _visit(getattr(channel, name), visit, position)
+    if inner is getattr(channel, name):
+        return channel, position
+    return eqx.tree_at(lambda c: getattr(c, name), channel, inner), position
 
 
 def _visit_chain(
-    maps: Sequence[AbstractRandomAffine], visit: Visit, place: Place
-) -> tuple[list[AbstractRandomAffine], Place]:
+    maps: Sequence[AbstractRandomAffine], visit: Visit, position: Position
+) -> tuple[list[AbstractRandomAffine], Position]:
     """The changed maps of a series, each of which receives what comes through those before it."""
-    parts, signal = [], place.signal
+    parts, signal = [], position.signal
     for i, affine in enumerate(maps):
-        changed, place = _visit(affine, visit, place._replace(signal=signal))
+        changed, position = _visit(affine, visit, position._replace(signal=signal))
         parts.append(changed)
         if signal is not None and i + 1 < len(maps):
             signal = Signal(_behind(affine, signal.second), signal.arrives * _arrival(affine))
-    return parts, place
+    return parts, position
 
 
 def _arrival(channel: AbstractRandomAffine) -> Scalar:
@@ -162,18 +169,18 @@ def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
     moments = channel.moments(2)
     tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
-    result: Second = xp.block(
+    behind: Second = xp.block(
         [[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]]
     )
-    return result
+    return behind
 
 
 def _line(second: Second, times: int) -> Second:
     """Moment of the line (y_k, y_{k-1}, ...): each as the present one; a delay chooses one of them, so no two meet."""
     xp = library(second)
     mean, blocks = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
-    result: Second = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
-    return result
+    line: Second = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    return line
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
@@ -194,13 +201,13 @@ def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarr
     Raises:
         ValueError: a choice that is there under no name.
     """
-    result = np.zeros(len(names), dtype=bool)
+    chosen_mask = np.zeros(len(names), dtype=bool)
     for choice in chosen:
         hit = np.array([name == choice or name.startswith(f"{choice}.") for name in names])
         if not np.any(hit):
             raise fail(what, f"names of transmitters {list(names)}", repr(choice))
-        result |= hit
-    return result
+        chosen_mask |= hit
+    return chosen_mask
 
 
 def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
@@ -279,7 +286,7 @@ def _amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
-        result: AbstractHop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
-        return result
+        changed: AbstractHop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
+        return changed
 
     return visit_hops(channel, change)

@@ -51,12 +51,12 @@ class AbstractRandomAffine(Module):
     @property
     def past(self) -> int:
         """Largest delay in steps: the inputs are y_k, y_{k-1}, ..., y_{k-past}, stacked."""
-        return max((part.past for part in held_maps(self)), default=0)
+        return max((affine.past for affine in held_maps(self)), default=0)
 
     @property
     def remembers(self) -> bool:
         """True if a draw depends on earlier draws; by default, if a map among the fields remembers."""
-        return any(part.remembers for part in held_maps(self))
+        return any(affine.remembers for affine in held_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the state before the first draw; () where the map forgets."""
@@ -146,19 +146,19 @@ class AbstractOfParts(AbstractRandomAffine):
     @property
     def erases(self) -> bool:
         """True if one of the parts erases."""
-        return any(part.erases for part in self.parts)
+        return any(affine.erases for affine in self.parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the same map made of each combination of the parts' extremes."""
-        return tuple(self.rebuilt(*parts) for parts in product(*(part.extremes() for part in self.parts)))
+        return tuple(self.rebuilt(*parts) for parts in product(*(affine.extremes() for affine in self.parts)))
 
     def corner_count(self) -> int:
         """Product of the parts' counts."""
-        return prod(part.corner_count() for part in self.parts)
+        return prod(affine.corner_count() for affine in self.parts)
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Return the same map made of its parts with their mean gains."""
-        return self.rebuilt(*(part.mean_gain() for part in self.parts))
+        return self.rebuilt(*(affine.mean_gain() for affine in self.parts))
 
 
 class AbstractOfOne(AbstractOfParts):
@@ -224,8 +224,8 @@ class AbstractOfOneShape(AbstractRandomAffine):
 def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
 
-    def is_map(item: object) -> bool:
-        return isinstance(item, AbstractRandomAffine)
+    def is_map(leaf: object) -> bool:
+        return isinstance(leaf, AbstractRandomAffine)
 
     return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
 
@@ -270,7 +270,7 @@ def advance(
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     """The memories on which the modes of a map (or of all maps in a tree) depend, by identity, in their order."""
     parts = jax.tree.leaves(channel, is_leaf=_is_modal)
-    return distinct(part.memory for part in parts if _is_modal(part))
+    return distinct(leaf.memory for leaf in parts if _is_modal(leaf))
 
 
 def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
@@ -288,8 +288,8 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
     assert isinstance(channel, AbstractRandomAffine)
     by_identity = dict(zip(memories(channel), states, strict=True))
 
-    def chosen(part: PyTree) -> PyTree:
-        return part.given(by_identity[part.memory.identity]) if _is_modal(part) else part
+    def chosen(leaf: PyTree) -> PyTree:
+        return leaf.given(by_identity[leaf.memory.identity]) if _is_modal(leaf) else leaf
 
     memoryless: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
     return memoryless
@@ -303,41 +303,41 @@ def anonymous(channel: T) -> T:
 
 def independent(maps: Sequence[T]) -> list[T]:
     """The same maps as links apart: an unnamed memory that stands in several of them becomes one of each."""
-    results, taken = [], set[str]()
-    for place, item in enumerate(maps):
-        held = memories(item)
-        again = {key: m.labelled(f"{key} of {place}") for key, m in held.items() if m.name is None and key in taken}
-        results.append(with_memories(item, again))
+    apart, taken = [], set[str]()
+    for index, affine in enumerate(maps):
+        held = memories(affine)
+        again = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
+        apart.append(with_memories(affine, again))
         taken |= set(held)
-    return results
+    return apart
 
 
-def one_memory(items: Sequence[T]) -> list[T]:
+def one_memory(maps: Sequence[T]) -> list[T]:
     """The same maps at later steps: unnamed memories of each are those of the first, in order of appearance."""
-    by_item = [memories(item) for item in items]
-    if not by_item[0] or len({len(held) for held in by_item}) > 1:
-        return list(items)
+    by_map = [memories(affine) for affine in maps]
+    if not by_map[0] or len({len(held) for held in by_map}) > 1:
+        return list(maps)
     labels = [
-        {key: m.labelled(label) for (key, m), label in zip(held.items(), by_item[0], strict=True) if m.name is None}
-        for held in by_item
+        {key: m.labelled(label) for (key, m), label in zip(held.items(), by_map[0], strict=True) if m.name is None}
+        for held in by_map
     ]
-    return [with_memories(item, twins) for item, twins in zip(items, labels, strict=True)]
+    return [with_memories(affine, twins) for affine, twins in zip(maps, labels, strict=True)]
 
 
 def with_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
     """The map with other memories in place of those of these identities."""
 
-    def replaced(part: PyTree) -> PyTree:
-        if not _is_modal(part) or part.memory.identity not in twins:
-            return part
-        return eqx.tree_at(lambda m: m.memory, part, twins[part.memory.identity])
+    def replaced(leaf: PyTree) -> PyTree:
+        if not _is_modal(leaf) or leaf.memory.identity not in twins:
+            return leaf
+        return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])
 
-    result: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
-    return result
+    exchanged: T = jax.tree.map(replaced, channel, is_leaf=_is_modal) if twins else channel
+    return exchanged
 
 
-def _is_modal(item: object) -> bool:
-    return isinstance(item, AbstractModal)
+def _is_modal(leaf: object) -> bool:
+    return isinstance(leaf, AbstractModal)
 
 
 def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
@@ -345,9 +345,9 @@ def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRa
     checked = tuple(items(name, maps, "random affine maps"))
     if not checked:
         raise fail(name, "at least one map", "none")
-    for item in checked:
-        if not isinstance(item, AbstractRandomAffine):
-            raise fail(name, "random affine maps (hops, and maps made of them)", shown(item))
+    for affine in checked:
+        if not isinstance(affine, AbstractRandomAffine):
+            raise fail(name, "random affine maps (hops, and maps made of them)", shown(affine))
     return checked
 
 

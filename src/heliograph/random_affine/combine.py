@@ -134,8 +134,8 @@ def homogeneous(matrix: Matrix) -> Matrix:
     outputs, inputs = matrix.shape
     right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
-    result: Matrix = xp.concatenate([xp.concatenate([matrix, right], axis=1), below])
-    return result
+    extended: Matrix = xp.concatenate([xp.concatenate([matrix, right], axis=1), below])
+    return extended
 
 
 def gain_moments(law: AbstractLaw, order: int) -> Vector:
@@ -224,13 +224,13 @@ class Series(AbstractOfMaps):
         """Draw each map and multiply."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         then = _after if self.erases else jnp.matmul
-        return state, reduce(lambda h, part: then(part, h), drawn)
+        return state, reduce(lambda h, matrix: then(matrix, h), drawn)
 
     @cached
     def moments(self, order: int) -> Moments:
         """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
-        matrix = reduce(lambda done, part: part.moments(order).matrix @ done, self.maps[1:],
+        matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
         return Moments(matrix, self.outputs, self.inputs, order)
 
@@ -238,9 +238,9 @@ class Series(AbstractOfMaps):
     def corner_moments(self, order: int) -> Corners:
         """Products of the parts' corners."""
         first, *rest = (m.corner_moments(order) for m in self.maps)
-        for part in rest:
-            items = part @ first[:, None]
-            first = items.reshape(-1, *items.shape[2:])
+        for corners in rest:
+            products = corners @ first[:, None]
+            first = products.reshape(-1, *products.shape[2:])
         return first
 
 
@@ -300,8 +300,8 @@ class Mixture(AbstractOfOneShape, AbstractOfMaps):
     def corner_moments(self, order: int) -> Corners:
         """The corners of the weights, with every combination of the maps' corners."""
         parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
-        chosen = np.array(list(product(*(range(len(part)) for part in parts)))).T
-        combined = stacked([part[item] for part, item in zip(parts, chosen, strict=True)])
+        chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
+        combined = stacked([corners[which] for corners, which in zip(parts, chosen, strict=True)])
         items = library(weights, combined).tensordot(weights, combined, axes=1)
         flat: Matrix = items.reshape(-1, *items.shape[2:])
         return flat
@@ -364,9 +364,9 @@ class Stack(AbstractOfMaps):
             a = powers[start : start + m.outputs]
             start += m.outputs
             k = sum(a)
-            part = table[k]
-            if part is not None:
-                polynomial = part[position(m.outputs + 1, k)[(*a, 0)]]
+            rows = table[k]
+            if rows is not None:
+                polynomial = rows[position(m.outputs + 1, k)[(*a, 0)]]
                 coefficients, degree = multiply(coefficients, degree, polynomial, k, variables), degree + k
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)

@@ -145,10 +145,10 @@ def _chosen(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
 def of_line(channel: T) -> T:
     """The channel (or all channels in a tree) as a plain map of the line."""
 
-    def plain(part: object) -> object:
-        return part.line if isinstance(part, AbstractOfLine) else part
+    def plain(leaf: object) -> object:
+        return leaf.line if isinstance(leaf, AbstractOfLine) else leaf
 
-    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
+    without_line: T = jax.tree.map(plain, channel, is_leaf=lambda leaf: isinstance(leaf, AbstractOfLine))
     return without_line
 
 
@@ -159,9 +159,9 @@ def sent(channel: AbstractRandomAffine) -> int:
 
 def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
     """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
-    local, size = channel.past, sent(channel)
-    rows = np.concatenate([t * total + start + np.arange(size) for t in range(local + 1)])
-    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if local else channel])
+    longest, size = channel.past, sent(channel)
+    rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
+    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if longest else channel])
     return OfLine(chosen, past) if past else chosen
 
 
@@ -204,13 +204,13 @@ class Held(AbstractWithBase):
         """Draw the present reception, and put it before the earlier ones."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
-        items = jnp.concatenate([h[None, :-1], before])
+        receptions = jnp.concatenate([h[None, :-1], before])
         rows = [
-            jnp.pad(item[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
-            for t, item in enumerate(items)
+            jnp.pad(reception[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
+            for t, reception in enumerate(receptions)
         ]
-        top = jnp.concatenate([jnp.concatenate(rows), items[..., -1].reshape(-1, 1)], axis=1)
-        return (inner, items[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
+        top = jnp.concatenate([jnp.concatenate(rows), receptions[..., -1].reshape(-1, 1)], axis=1)
+        return (inner, receptions[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
 class Relayed(AbstractOfLine):

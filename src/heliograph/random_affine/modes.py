@@ -62,7 +62,7 @@ class Modes(AbstractOfOneShape, AbstractModal):
         if isinstance(state, int | np.integer):
             return self.maps[state]
         leaves, trees = zip(*(jax.tree.flatten(m) for m in self.maps), strict=True)
-        shapes = {tuple(np.shape(leaf) for leaf in part) for part in leaves}
+        shapes = {tuple(np.shape(leaf) for leaf in of_mode) for of_mode in leaves}
         if len(set(trees)) > 1 or len(shapes) > 1:
             return _Chosen(self.maps, jnp.asarray(state))
         numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
@@ -213,18 +213,18 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
-    items = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
-    total = prod(len(item.initial) for item in items)
+    chains = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
+    total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
-    xp = library(items)
+    xp = library(chains)
     # Independent memories: their laws multiply.
-    initial = reduce(xp.kron, [item.initial for item in items], np.ones(1))
-    transition = reduce(xp.kron, [item.transition for item in items], np.ones((1, 1)))
-    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(item.states for item in items)))
+    initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
+    transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
+    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(chain.states for chain in chains)))
     for m in maps:
         check_forgets("channel of a filter", m)
-    most = reduce(xp.kron, [item.transition + item.radius for item in items], np.ones((1, 1)))
+    most = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
     return JointModes(initial, transition, most - transition, maps)
 
 
@@ -240,13 +240,13 @@ def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
         case AbstractModal():
             return int(channel.memory.identity == identity)
         case Stack() | Mixture():
-            return max(degree_in(part, identity) for part in channel.maps)
+            return max(degree_in(affine, identity) for affine in channel.maps)
         case Lift():
             return channel.degree * degree_in(channel.base, identity)
     parts = jax.tree.leaves(
-        channel, is_leaf=lambda item: item is not channel and isinstance(item, AbstractRandomAffine)
+        channel, is_leaf=lambda leaf: leaf is not channel and isinstance(leaf, AbstractRandomAffine)
     )
-    return sum(degree_in(part, identity) for part in parts if isinstance(part, AbstractRandomAffine))
+    return sum(degree_in(leaf, identity) for leaf in parts if isinstance(leaf, AbstractRandomAffine))
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel
@@ -280,10 +280,10 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
 
 def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
     """Law of the mode at each step."""
-    result = [np.asarray(steps[0].initial)]
+    over_steps = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
-        result.append(result[-1] @ np.asarray(step.transition))
-    return result
+        over_steps.append(over_steps[-1] @ np.asarray(step.transition))
+    return over_steps
 
 
 def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
@@ -301,8 +301,8 @@ def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
     starts = 1 if constant else len(items)
     for k, law in enumerate(laws(items)[:starts]):
         apart = law[:, None] * (means[k] - law @ means[k])
-        for item, later in zip(items[k:-1], means[k + 1 :], strict=True):
-            apart = np.asarray(item.transition).T @ apart
+        for step, later in zip(items[k:-1], means[k + 1 :], strict=True):
+            apart = np.asarray(step.transition).T @ apart
             if np.max(np.abs(apart.T @ later)) > ROUNDING * size:
                 return False
     return True

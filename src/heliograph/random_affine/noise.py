@@ -155,26 +155,26 @@ class Independent(AbstractNoise):
         self.parts = tuple(items("independent noises", parts, "laws"))
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
-        for part in self.parts:
-            if not isinstance(part, AbstractNoise):
-                raise fail("independent noises", "laws of a noise vector", shown(part))
-        means, blocks = [part.mean for part in self.parts], [part.covariance for part in self.parts]
+        for component in self.parts:
+            if not isinstance(component, AbstractNoise):
+                raise fail("independent noises", "laws of a noise vector", shown(component))
+        means, blocks = [component.mean for component in self.parts], [component.covariance for component in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
         keys = jax.random.split(key, len(self.parts))
-        return jnp.concatenate([part.sample(k) for part, k in zip(self.parts, keys, strict=True)])
+        return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 
     def moment(self, powers: Exponents) -> Number:
         """Return prod_parts E[n_part^a_part]."""
         value: Number = 1.0
         start = 0
-        for part in self.parts:
-            part_powers = tuple(powers[start : start + part.dimension])
-            start += part.dimension
-            value *= part.moment(part_powers) if any(part_powers) else 1.0
+        for component in self.parts:
+            component_powers = tuple(powers[start : start + component.dimension])
+            start += component.dimension
+            value *= component.moment(component_powers) if any(component_powers) else 1.0
         return value
 
 

@@ -143,9 +143,9 @@ class Contaminated(AbstractNoise):
         center, variance = _exponential_slices(count)
         xp = library(factor, inlier, share)
         units = xp.broadcast_to(factor, (n,))
-        part = scalar("share of outliers", share, 0.0, 1.0) / count
+        slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
         spreads = [inlier + v * xp.outer(units, units) for v in variance]
-        return cls(inlier, xp.stack([part] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
+        return cls(inlier, xp.stack([slice_share] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
 
     @classmethod
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
@@ -195,7 +195,7 @@ def branches(noise: AbstractNoise) -> Branches:
     """Branches of each component: those of the law, 25 of Student's, one of any other law, with its two moments."""
     match noise:
         case Independent():
-            return _stacked([branches(part) for part in noise.parts])
+            return _stacked([branches(component) for component in noise.parts])
         case Contaminated():
             xp, n = library(noise.shares), noise.dimension
             shares = xp.broadcast_to(_log(noise.shares), (n, len(noise.shares)))
@@ -233,9 +233,9 @@ def nominal(noise: AbstractNoise) -> Nominal:
     """The first branch of contaminated noise, the scale of Student's, the law's own moments else."""
     match noise:
         case Independent():
-            items = [nominal(part) for part in noise.parts]
+            items = [nominal(law) for law in noise.parts]
             xp, block = library(items), scipy_for(items).linalg.block_diag
-            return Nominal(xp.concatenate([part.mean for part in items]), block(*[part.covariance for part in items]))
+            return Nominal(xp.concatenate([law.mean for law in items]), block(*[law.covariance for law in items]))
         case Contaminated():
             return Nominal(noise.means[0] - noise.mean, noise.covariances[0])
         case StudentT():
@@ -246,15 +246,15 @@ def nominal(noise: AbstractNoise) -> Nominal:
 def has_outliers(noise: AbstractNoise) -> bool:
     """Ask whether the law says that there are outliers."""
     if isinstance(noise, Independent):
-        return any(has_outliers(part) for part in noise.parts)
+        return any(has_outliers(component) for component in noise.parts)
     return isinstance(noise, StudentT | Contaminated)
 
 
 def is_bounded(*parts: PyTree) -> bool:
     """Ask whether some noise in these parts of a network is known by a bound of its covariance alone."""
 
-    def is_law(item: object) -> bool:
-        return isinstance(item, Contaminated)
+    def is_law(leaf: object) -> bool:
+        return isinstance(leaf, Contaminated)
 
     return any(leaf.bounded for leaf in jax.tree.leaves(parts, is_leaf=is_law) if is_law(leaf))
 
@@ -270,7 +270,7 @@ def _shares(share: ArrayLike) -> tuple[list[Number], bool]:
     values = array("shares of outliers", share, ("kinds",))
     if not len(values):
         raise fail("shares of outliers", "at least one", "none")
-    total = sum(scalar("share of outliers", part, 0.0, 1.0) for part in values)
+    total = sum(scalar("share of outliers", value, 0.0, 1.0) for value in values)
     scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12) if not is_traced(total) else None
     return list(values), True
 
@@ -309,11 +309,11 @@ def _log(value: Vector) -> Vector:
 
 def _stacked(parts: list[Branches]) -> Branches:
     """Components of several laws one above the other, as many branches each as the one with most has."""
-    xp, most = library(parts), max(part.mean.shape[1] for part in parts)
+    xp, most = library(parts), max(law.mean.shape[1] for law in parts)
     fills = (-np.inf, 0.0, 1.0)
 
-    def padded(part: Branches) -> list[Matrix]:
-        more = ((0, 0), (0, most - part.mean.shape[1]))
-        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(part, fills, strict=True)]
+    def padded(law: Branches) -> list[Matrix]:
+        more = ((0, 0), (0, most - law.mean.shape[1]))
+        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
 
     return Branches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))

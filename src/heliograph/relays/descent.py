@@ -86,8 +86,8 @@ class _Limited:
         if self.updates:
             s, y = self.updates[-1]
             v = v * float(s @ y / (y @ y))
-        for (s, y), part in zip(self.updates, reversed(parts), strict=True):
-            v = v + (part - float(y @ v / (s @ y))) * s
+        for (s, y), weight in zip(self.updates, reversed(parts), strict=True):
+            v = v + (weight - float(y @ v / (s @ y))) * s
         return v
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:

@@ -57,6 +57,10 @@ class RelayDesign(Module):
 def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     """Compute error covariances and power of a `network` under any gains, {filter: (steps, n, received)}.
 
+    Args:
+        network: relays that filter.
+        gains: K by filter, (steps, n, received).
+
     Raises:
         ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
     """
@@ -82,10 +86,10 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
     n, first = len(network.states), network.filters[0]
     length = len(array(f"gains of {first!r}", gains[first], (None, None, None)))
     joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
-    for f, (name, item) in enumerate(zip(network.filters, network.received, strict=True)):
-        value = array(f"gains of {name!r}", gains[name], (length, n, item))
-        joined[:, f * n : (f + 1) * n, start : start + item] = value
-        start += item
+    for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
+        value = array(f"gains of {name!r}", gains[name], (length, n, size))
+        joined[:, f * n : (f + 1) * n, start : start + size] = value
+        start += size
     return joined
 
 
@@ -95,22 +99,22 @@ def split_gains(
     """Gains by filter from block matrices."""
     n, ends = len(network.states), np.cumsum(network.received)
     return {
-        name: np.asarray(joined)[:, f * n : (f + 1) * n, end - item : end]
-        for f, (name, item, end) in enumerate(zip(network.filters, network.received, ends, strict=True))
+        name: np.asarray(joined)[:, f * n : (f + 1) * n, end - size : end]
+        for f, (name, size, end) in enumerate(zip(network.filters, network.received, ends, strict=True))
     }
 
 
-def as_design(network: RelayNetwork, result: Propagated) -> RelayDesign:
+def as_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
     """Name the parts of a propagation."""
-    moments, n = np.asarray(result.moments), len(network.states)
+    moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
         raise fail("design", "finite second moments", f"some that are not after step {step} (is a link noiseless?)")
     blocks = {name: slice((1 + f) * n, (2 + f) * n) for f, name in enumerate(network.filters)}
     return RelayDesign(
-        gains=split_gains(network, np.asarray(result.gains)),
+        gains=split_gains(network, np.asarray(propagated.gains)),
         covariance={name: moments[:, rows, rows] for name, rows in blocks.items()},
-        power={name: np.asarray(result.power)[:, 1 + r] for r, name in enumerate(network.relays)},
+        power={name: np.asarray(propagated.power)[:, 1 + r] for r, name in enumerate(network.relays)},
         moments=moments,
     )
 
@@ -120,6 +124,10 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
     s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
     "exact" for complete data from the network it was designed for.
+
+    Args:
+        network: relays that filter.
+        design: of this network.
 
     Raises:
         ValueError: a design of another network.
@@ -134,9 +142,9 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     n, before = len(network.states), np.asarray(_before_correction(steps, design.moments[:-1]))
     d = design.moments.shape[-1]
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
-    result = {}
-    for f, (name, item) in enumerate(zip(network.filters, network.received, strict=True)):
-        mine = slice(ends[name] - item, ends[name])
+    schedules = {}
+    for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
+        mine = slice(ends[name] - size, ends[name])
         error = slice((1 + f) * n, (2 + f) * n)
         believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
         gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]
@@ -145,8 +153,8 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
         arrays = Gains(*moved, *moved, expected, constant, *believed)
-        result[name] = Schedule(arrays, network.initial()[0], "exact")
-    return result
+        schedules[name] = Schedule(arrays, network.initial()[0], "exact")
+    return schedules
 
 
 @compiled
@@ -170,9 +178,9 @@ def expected_maps(steps: Steps) -> tuple[Float[np.ndarray, "time R n"], Float[np
 def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
     """Matrices C_k with <C_k, moments_k> = weights_k tr P_k."""
     d = (1 + filters) * n
-    result = np.zeros((len(weights), d, d))
-    result[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
-    return result
+    matrices = np.zeros((len(weights), d, d))
+    matrices[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
+    return matrices
 
 
 def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
@@ -180,6 +188,10 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
 
     K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
     what the receiver can know later (see `receiver_error_design`).
+
+    Args:
+        network: relays that filter.
+        horizon: number of steps.
 
     Raises:
         ValueError: a horizon beyond what varies over time; a singular innovation moment.
@@ -210,6 +222,10 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
 
     z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
     `receiver_behind_relays` with its covariance propagated on line: for data with gaps, and for smoothing.
+
+    Args:
+        network: relays that filter.
+        gains: K by relay, (steps, n, received).
 
     Raises:
         ValueError: what `receiver_behind_relays` refuses.
@@ -284,8 +300,8 @@ def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"
 def _sides(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """`relay_side` at each step."""
 
-    def single(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
-        p, gain = item
+    def single(moments: jax.Array, row: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
+        p, gain = row
         return correct(step_moments(p, moments)[0], gain * p.live), relay_side(p, moments, gain)
 
     return jax.lax.scan(single, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

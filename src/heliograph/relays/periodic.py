@@ -45,26 +45,33 @@ def periodic_steps(network: RelayNetwork) -> Steps:
     if radius >= 1:
         raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
     mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
-    result: Steps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
-    return result
+    steady_steps: Steps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
+    return steady_steps
 
 
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
 
+    Args:
+        network: relays that filter, in slots that repeat.
+
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
-    result, change = _solve_local_steady(periodic_steps(network), start_moments(network))
+    propagated, change = _solve_local_steady(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
-    return as_design(network, result)
+    return as_design(network, propagated)
 
 
 def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     """Return the steady state of a `network` under given gains, one entry per slot: {filter: (slots, n, received)}.
 
     The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
+
+    Args:
+        network: relays that filter, in slots that repeat.
+        gains: K by filter, (slots, n, received).
 
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
@@ -148,12 +155,12 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     d = side.transition.shape[-1]
 
     # Riccati recursion of the receiver, held constant under differentiation.
-    def predict(spread: jax.Array, item: RelaySide) -> jax.Array:
-        both = jnp.concatenate([item.transition, item.output])
-        return both @ spread @ both.T + item.noise
+    def predict(spread: jax.Array, at_slot: RelaySide) -> jax.Array:
+        both = jnp.concatenate([at_slot.transition, at_slot.output])
+        return both @ spread @ both.T + at_slot.noise
 
-    def best(spread: jax.Array, item: RelaySide) -> tuple[jax.Array, jax.Array]:
-        z = predict(spread, item)
+    def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
+        z = predict(spread, at_slot)
         gain = jnp.linalg.solve(z[d:, d:], z[d:, :d]).T
         after = z[:d, :d] - gain @ z[d:, :d]
         return (after + after.T) / 2, gain
@@ -166,10 +173,10 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     best_gains = jax.lax.stop_gradient(jax.lax.scan(best, converged, held)[1])
 
     # Joseph form with these gains: affine in the covariance, so its fixed point is one linear solve.
-    def given(spread: jax.Array, item: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        part, gain = item
+    def given(spread: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        at_slot, gain = row
         close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
-        after = close @ predict(spread, part) @ close.T
+        after = close @ predict(spread, at_slot) @ close.T
         return after, after
 
     def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -317,8 +324,8 @@ def _units(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Flo
     return join_gains(
         network,
         {
-            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), item))
-            for (name, value), item in zip(largest.items(), network.received, strict=True)
+            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), size))
+            for (name, value), size in zip(largest.items(), network.received, strict=True)
         },
     )
 
@@ -348,23 +355,23 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
             return _penalised(trace, sound, power, limit, multipliers), power
 
-        (result, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
-        return result, gradient, power
+        (cost, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
+        return cost, gradient, power
 
     return compiled(value)
 
 
 def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    result, n = steady(steps, gains), steps.transition.shape[-1]
-    last = result.moments[1:, -n:, -n:]
-    return jnp.trace(last, axis1=1, axis2=2), is_covariance(result.moments), jnp.sum(result.power[:, 1:], axis=1)
+    end, n = steady(steps, gains), steps.transition.shape[-1]
+    last = end.moments[1:, -n:, -n:]
+    return jnp.trace(last, axis1=1, axis2=2), is_covariance(end.moments), jnp.sum(end.power[:, 1:], axis=1)
 
 
 def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    result, n = steady(steps, gains), steps.transition.shape[-1]
+    end, n = steady(steps, gains), steps.transition.shape[-1]
     spread = steady_behind(steps, gains)
-    sound = is_covariance(result.moments[:, :-n, :-n]) & is_covariance(spread)
-    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(result.power[:, 1:], axis=1)
+    sound = is_covariance(end.moments[:, :-n, :-n]) & is_covariance(spread)
+    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(end.power[:, 1:], axis=1)
 
 
 _receiver_cost = _value(_receiver_traces)

@@ -89,18 +89,18 @@ def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
 
 
 def best_within(
-    problem: Limited, local: Float[np.ndarray, "time Fn R"], iterations: int
+    problem: Limited, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
-    """Gains of small cost that meet the limit; never dearer than `local`, if those meet it.
+    """Gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
-    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local`, over the gains of all steps at
-    once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that happens
-    to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
+    Descends f - t sum_k log(1 - p_k / limit_k), f the cost in units of that of `local_gains`, over the gains of all
+    steps at once, for ever smaller t. Every point on the way is strictly inside, so nothing hangs on a last sweep that
+    happens to meet all limits at once; and t falls little at a time, since long descents multiply what rounding leaves.
     """
-    whole = float(_judge(problem, local)[0])
+    whole = float(_judge(problem, local_gains)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
-    results = [local, _inside(problem, local)]
-    for barrier in BARRIERS / len(local):
+    results = [local_gains, _inside(problem, local_gains)]
+    for barrier in BARRIERS / len(local_gains):
         gains = results[-1]
         units = np.asarray(_units(problem, gains, barrier))
         function = partial(_descended, problem, gains, units, barrier)
@@ -114,12 +114,12 @@ def best_within(
     return results[best]
 
 
-def _inside(problem: Limited, local: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
-    """`local` with the relays' gains smaller by one factor, so that ROOM is left; without gains all of it is."""
-    relays = local.shape[1] - problem.steps.transition.shape[-1]
+def _inside(problem: Limited, local_gains: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
+    """`local_gains` with the relays' gains smaller by one factor, so that ROOM is left; without gains all of it is."""
+    relays = local_gains.shape[1] - problem.steps.transition.shape[-1]
 
     def smaller(factor: float) -> np.ndarray:
-        return np.concatenate([factor * local[:, :relays], local[:, relays:]], axis=1)
+        return np.concatenate([factor * local_gains[:, :relays], local_gains[:, relays:]], axis=1)
 
     low, high = 0.0, 2.0  # the first half is 1, the gains as they are
     for _ in range(HALVINGS):
@@ -127,7 +127,7 @@ def _inside(problem: Limited, local: Float[np.ndarray, "time Fn R"]) -> Float[np
         if np.min(_judge(problem, smaller(middle))[1]) < ROOM:
             high = middle
         elif middle == 1.0:
-            return local
+            return local_gains
         else:
             low = middle
     return smaller(low)
@@ -162,8 +162,8 @@ def _barrier(
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
 
-    result: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
-    return result
+    value_and_slope: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
+    return value_and_slope
 
 
 def _descended(
@@ -185,8 +185,8 @@ def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
     slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
-    def back(ahead: jax.Array, item: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain, before, slope_k = item
+    def back(ahead: jax.Array, row: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        p, gain, before, slope_k = row
         ahead = ahead + slope_k
         normal, _ = normal_matrix(step_moments(p, before)[0], ahead, p, DAMPING)
         free = jnp.asarray(p.live)[np.nonzero(gain_mask(p))[1]]
@@ -252,13 +252,13 @@ def _backward(
 ) -> Float[jax.Array, "time d d"]:
     """Gradient of the cost with respect to the moments after each step, gains improved."""
 
-    def ahead_of(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain = item
+    def ahead_of(moments: jax.Array, row: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        p, gain = row
         z, _ = step_moments(p, moments)
         return correct(z, gain), z
 
-    def back(ahead: jax.Array, item: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        p, gain, z_k, cost_k = item
+    def back(ahead: jax.Array, row: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        p, gain, z_k, cost_k = row
         ahead = ahead + cost_k
         return pull_back(p, best_gain(z_k, ahead, gain, p), ahead), ahead
 
@@ -271,9 +271,9 @@ def _forward(steps: Steps, start: Array, gains: jax.Array, ahead: jax.Array) -> 
     """Best gains step by step and the moments after each step."""
 
     def single(
-        moments: jax.Array, item: tuple[Steps, jax.Array, jax.Array]
+        moments: jax.Array, row: tuple[Steps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        p, gain, ahead_k = item
+        p, gain, ahead_k = row
         z, _ = step_moments(p, moments)
         gain = best_gain(z, ahead_k, gain, p)
         after = correct(z, gain)
@@ -295,7 +295,7 @@ def _sweeps(
     steps: Steps,
     start: Float[Array, "d d"],
     cost: Float[Array, "time d d"],
-    local: Float[Array, "time Fn R"],
+    local_gains: Float[Array, "time Fn R"],
     count: Int[Array, "sweeps"],
 ) -> Float[Array, "time Fn R"]:
     """The best gains of sweeps from the own-error gains."""
@@ -307,7 +307,7 @@ def _sweeps(
         best = jnp.where(better, gains, search.best)
         return Search(gains, best, jnp.where(better, value, search.cost)), None
 
-    first = jnp.asarray(local)
+    first = jnp.asarray(local_gains)
     value = jnp.sum(cost * propagate(steps, start, first).moments[1:])
     search, _ = jax.lax.scan(sweep, Search(first, first, value), jnp.asarray(count))
     return search.best

@@ -50,8 +50,8 @@ def linear_maps(p: Steps) -> LinearMaps:
     local_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
     believed = jnp.stack([jnp.asarray(c) for c in local_sends])
     expects = jnp.asarray(p.gain) @ believed.reshape(-1, n)  # prediction of each row, as a map of its filter's estimate
-    local = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
-    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - local, sent)
+    expected = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
+    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - expected, sent)
 
 
 def sent_mean(p: Steps) -> Float[jax.Array, "sent"]:
@@ -122,8 +122,8 @@ def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "tim
     Entries of given gains on rows that receive nothing are not used.
     """
 
-    def single(moments: jax.Array, item: tuple[Steps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        p, gain = item
+    def single(moments: jax.Array, row: tuple[Steps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        p, gain = row
         z, sent = step_moments(p, moments)
         used = local_gain(z, p) if gain is None else gain * p.live
         after = correct(z, used)

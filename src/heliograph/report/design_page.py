@@ -57,7 +57,7 @@ def summary(results: DesignResults) -> dict[str, Json]:
     """Return all numbers of the report."""
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
-    place = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
+    best = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
     return {
         "error": design.error,
         "present": design.present,
@@ -71,7 +71,7 @@ def summary(results: DesignResults) -> dict[str, Json]:
         "price": design.price,
         "front": {key: np.asarray(value).tolist() for key, value in results.front._asdict().items()},
         "changes": {change.name: {"value": change.value, "saved": change.saved} for change in results.changes},
-        "map": place,
+        "map": best,
     }  # fmt: skip
 
 

@@ -39,9 +39,9 @@ STYLE: Any = {  # of matplotlib's rcParams
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """Place the legend of `axes` above all panels."""
     handles, names = axes.get_legend_handles_labels()
-    local = axes.get_legend()
-    if local is not None:
-        local.remove()
+    legend = axes.get_legend()
+    if legend is not None:
+        legend.remove()
     if names:
         figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns), frameon=False)
 

@@ -47,7 +47,7 @@ def fit_figures(learned: Learned) -> dict[str, Figure]:
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
     if tested:
         drawn["innovations"] = _correlations(tested)
-    received = [item for item in learned.uniform if np.any(~np.isnan(item.pit))][:MOST]
+    received = [transforms for transforms in learned.uniform if np.any(~np.isnan(transforms.pit))][:MOST]
     if received:
         drawn["pits"] = _pits(received)
     return drawn
@@ -65,11 +65,11 @@ def _estimates(learned: Learned) -> Figure:
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         # The form that counts is on top; a cross marks a number that the data do not determine.
         for j, form in enumerate(reversed(forms)):
-            item = by_form[form][i]
+            e = by_form[form][i]
             color = BLUE if j == 0 else MUTED
-            if np.isfinite([item.low, item.high]).all():
-                axes.plot([item.low, item.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
-            axes.plot(item.estimate, -j, "o" if item.identified else "x", color=color, markersize=6)
+            if np.isfinite([e.low, e.high]).all():
+                axes.plot([e.low, e.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
+            axes.plot(e.estimate, -j, "o" if e.identified else "x", color=color, markersize=6)
         axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
@@ -84,16 +84,16 @@ def _correlations(tested: list[Change]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.7 + 1.6 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
     # Correlation of innovations by lag, before and after, with 95 % intervals.
-    for axes, item in zip(grid, tested, strict=True):
-        for shift, color, part, label in ((-0.17, AMBER, item.before, "before"), (0.17, BLUE, item.after, "after")):
-            assert part.test is not None
-            lags = np.arange(1, len(part.test.correlation) + 1)
-            axes.bar(lags + shift, part.test.correlation, 0.3, color=color, label=label)
+    for axes, change in zip(grid, tested, strict=True):
+        for shift, color, e, label in ((-0.17, AMBER, change.before, "before"), (0.17, BLUE, change.after, "after")):
+            assert e.test is not None
+            lags = np.arange(1, len(e.test.correlation) + 1)
+            axes.bar(lags + shift, e.test.correlation, 0.3, color=color, label=label)
             axes.errorbar(
-                lags + shift, part.test.correlation, 1.96 * part.test.standard_error, fmt="none", ecolor=MUTED, lw=1
+                lags + shift, e.test.correlation, 1.96 * e.test.standard_error, fmt="none", ecolor=MUTED, lw=1
             )
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(f"{item.node}/{item.filter}"))
+        axes.set_title(in_figure(f"{change.node}/{change.filter}"))
         axes.set_ylabel("correlation")
         axes.set_xticks(lags)
     legend_above(figure, grid[0])
@@ -105,14 +105,14 @@ def _correlations(tested: list[Change]) -> Figure:
 def _pits(received: list[Uniformity]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.7 + 1.5 * len(received)), layout="constrained")
     grid = figure.subplots(len(received), 1, squeeze=False, sharex=True)[:, 0]
-    for axes, item in zip(grid, received, strict=True):
-        values = item.pit[~np.isnan(item.pit)]
+    for axes, transforms in zip(grid, received, strict=True):
+        values = transforms.pit[~np.isnan(transforms.pit)]
         count = len(values)
         low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
         axes.hist(values, np.linspace(0, 1, BINS + 1), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
         axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(item.node))
+        axes.set_title(in_figure(transforms.node))
         axes.set_ylabel("density")
     grid[-1].set_xlabel("probability of a smaller value")
     return figure
@@ -148,13 +148,13 @@ def _lead(learned: Learned) -> str:
     outputs = [(change, change.gain) for change in learned.changes if change.gain is not None]
     if not outputs:
         return whence
-    item, gain = outputs[0]
+    change, gain = outputs[0]
     error = 1.96 * gain.standard_error
     what = "better" if gain.difference > error else "worse" if gain.difference < -error else "neither better nor worse"
     return (
         f"On the {learned.held_out:,} rows after these, which it was not given, the filter "
-        f"{visible(f'{item.node}/{item.filter}')} predicts {what} with the learned numbers than with those before: its "
-        f"log-likelihood changes by {gain.difference:+.3f} ± {error:.3f} a row. {whence}"
+        f"{visible(f'{change.node}/{change.filter}')} predicts {what} with the learned numbers than with those before: "
+        f"its log-likelihood changes by {gain.difference:+.3f} ± {error:.3f} a row. {whence}"
     )
 
 
@@ -219,7 +219,7 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
     # One row for each filter: gain of the log-likelihood, size and correlation of its innovations.
     rows = []
     for change in learned.changes:
-        test = [part.test for part in (change.before, change.after)]
+        test = [judged.test for judged in (change.before, change.after)]
         sizes = ["–" if t is None else f"{t.power:.2f} ± {1.96 * t.power_error:.2f}" for t in test]
         memory = ["–" if t is None else f"{t.correlation[0]:.2f} (p {t.p_value:.2g})" for t in test]
         gain = (
@@ -244,7 +244,7 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
             "all are equally likely: 95 % of the bars end in the grey band. High in the middle: the network expects "
             "too much spread; high at the ends: too little."
         )
-        kinds = {item.by_law for item in learned.uniform}
+        kinds = {transforms.by_law for transforms in learned.uniform}
         how = (
             "The laws of the gains are used in full."
             if kinds == {True}
@@ -279,9 +279,9 @@ def _losses(learned: Learned) -> list[Section]:
 def _delays(learned: Learned) -> list[Section]:
     """Describe how late the measurements of events were."""
     rows = [
-        [visible(node), f"{steps * item.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
-        for node, item in learned.fit.delays.items()
-        for steps, share in item.shares.items()
+        [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
+        for node, delays in learned.fit.delays.items()
+        for steps, share in delays.shares.items()
     ]
     caption = (
         "How long measurements were on their way, in steps, with the probability of each delay and its 95 % interval. "

@@ -72,8 +72,8 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
-        for item in self.doubted():
-            lines += _doubts(item)
+        for doubted in self.doubted():
+            lines += _doubts(doubted)
         return lines
 
     def doubted(self) -> list[FilterHealth]:
@@ -111,22 +111,22 @@ def examine(
     # Links: when each component arrived.
     links = []
     for node in received:
-        z, place = received[node], network.nodes[node]
-        for i, name in enumerate(place.received_names):
+        z, receiver = received[node], network.nodes[node]
+        for i, name in enumerate(receiver.received_names):
             there = ~np.isnan(z[:, i])
-            links.append(Link(node, name, there, z[there, i], not place.complete))
+            links.append(Link(node, name, there, z[there, i], not receiver.complete))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in listeners(network, record):
-        node, name, item, z = listener[:4]
+        node, name, filter, z = listener[:4]
         advance(f"testing {node}/{name}")
         white = None
-        if item.claim != "none" and item.received:
-            white = whitened_innovations(z, item, inputs)
+        if filter.claim != "none" and filter.received:
+            white = whitened_innovations(z, filter, inputs)
             outputs += outputs_of(listener, record, inputs)
         lags = min(LAGS, len(z) // 10)
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
         lost = np.any(record.estimates[node][name].claims == "none")
-        filters.append(FilterHealth(node, name, "none" if lost else item.claim, white, test, listener.trusted))
+        filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
     return Health(record, links, filters, outputs, network.shared)

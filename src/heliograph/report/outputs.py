@@ -37,7 +37,7 @@ def errors_of(record: Record) -> list[Errors]:
         return []
     known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)
     results = []
-    for node, estimates in sorted(record.estimates.items(), key=lambda item: item[0] != FUSED):
+    for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != FUSED):
         for name, estimate in estimates.items():
             values = record.nees(node, name)
             judged = ~np.isnan(values)
@@ -90,8 +90,8 @@ def listeners(network: Network, record: Record) -> Iterator[Listener]:
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
         blaming = weighing & relied_on[node] or weighing
-        for name, item in filters.items():
-            yield Listener(node, name, item, z, names, name in relied_on[node], name in blaming)
+        for name, filter in filters.items():
+            yield Listener(node, name, filter, z, names, name in relied_on[node], name in blaming)
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
@@ -103,10 +103,10 @@ def _relied_on(network: Network) -> dict[str, set[str]]:
 
     Others, such as one that takes the mean of a random gain for it, are there to be compared with.
     """
-    fused = {item.filter for item in (network.fused | network.meshes).values() if isinstance(item, Fusion)}
+    fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
     results = {}
-    for node, place in network.nodes.items():
-        claims = {name: STRENGTH[claim_at(place, filter)] for name, filter in place.filters.items()}
+    for node, receiver in network.nodes.items():
+        claims = {name: STRENGTH[claim_at(receiver, filter)] for name, filter in receiver.filters.items()}
         strongest = [name for name, s in claims.items() if s == max(claims.values())]
         results[node] = fused & set(claims) or set(strongest[:1])
     return results
@@ -125,9 +125,9 @@ def outputs_of(listener: Listener, record: Record, inputs: np.ndarray) -> list[O
     known = record.weighed.get(listener.node, {}).get(listener.name)
     if known is not None:
         return _health(listener.node, listener.name, listener.outputs, known, True, listener.blames)
-    result = listener.filter.run(listener.measurements, inputs)
-    variance = np.diagonal(result.innovation_covariances, axis1=-2, axis2=-1)
-    innovations = Weighed(result.innovations, variance, np.ones_like(result.innovations))
+    outcome = listener.filter.run(listener.measurements, inputs)
+    variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
+    innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
     return _health(listener.node, listener.name, listener.outputs, innovations, False, False)
 
 
@@ -154,23 +154,23 @@ class RecentOutputs:
 
     def add(self, node: str, name: str, outputs: Mapping[str, Sequence[float | None]]) -> None:
         """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
-        row = [outputs[part] for part in ("value", "variance", "weight")]
+        row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
 
     def health(self) -> list[OutputHealth]:
         """Summarise each output of each filter over its newest rows."""
-        result = []
+        summaries = []
         for (node, name), rows in self._rows.items():
             innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))
             names = self.names.get((node, name)) or [str(i + 1) for i in range(innovations.value.shape[1])]
-            result += _health(node, name, names, innovations, True, True)
-        return result
+            summaries += _health(node, name, names, innovations, True, True)
+        return summaries
 
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
-    chosen = (item for item in listeners(network, record) if item.name in record.weighed.get(item.node, {}))
-    return [output for item in chosen for output in outputs_of(item, record, np.zeros(0))]
+    chosen = (x for x in listeners(network, record) if x.name in record.weighed.get(x.node, {}))
+    return [output for x in chosen for output in outputs_of(x, record, np.zeros(0))]
 
 
 def output_numbers(health: OutputHealth) -> dict[str, Json]:

@@ -90,7 +90,7 @@ class Statements:
     @property
     def judged(self) -> list[Judged]:
         """Sort statements by verdict, else in their original order."""
-        return sorted(self.statements, key=lambda item: list(VERDICTS).index(item.verdict))
+        return sorted(self.statements, key=lambda statement: list(VERDICTS).index(statement.verdict))
 
 
 @dataclass(frozen=True)
@@ -160,15 +160,15 @@ class Page:
 
 def environment() -> Environment:
     """Return the environment of this room's templates, in which all values are escaped."""
-    result = Environment(
+    templates = Environment(
         loader=PackageLoader("heliograph.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    result.filters["rich"] = rich
-    return result
+    templates.filters["rich"] = rich
+    return templates
 
 
 def rich(text: str) -> Markup:

@@ -68,10 +68,10 @@ def write_results(
         import_module(name)
     check_replaceable(target, SUMMARY)
     with progress(stages + 1) as advance, whole_folder(target) as folder:
-        result = compute(advance)
+        outcome = compute(advance)
         advance("drawing and writing")
-        _write(results_of(result), folder)
-    return result
+        _write(results_of(outcome), folder)
+    return outcome
 
 
 def _write(results: Results, folder: Path) -> None:

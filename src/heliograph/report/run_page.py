@@ -1,28 +1,33 @@
 """Report of a run over a recording: estimates with bands, innovations, links, and warnings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 import matplotlib
 import numpy as np
-from cycler import cycler
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
-from heliograph.report.health import FilterHealth, Health
+from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above
+from heliograph.report.health import Health
+from heliograph.report.innovations import (
+    BAND,
+    COLOURS,
+    LOOK,
+    MOST,
+    chosen,
+    innovations_figure,
+    innovations_section,
+    not_drawn,
+    rounded,
+    tested_by_figure,
+    time_axis,
+)
 from heliograph.report.outputs import errors_of, output_numbers
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
-
-COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
-FEW = 8  # pictures one below the other; of more, one is chosen from a list
-MOST = 64  # nodes and links that are drawn; tables and summary hold all
-BAND = 2.0  # deviations
-LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
 
 
 def run_results(health: Health, network: str) -> Results:
@@ -35,7 +40,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     for kind, record in _estimated(health):
         drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
-    drawn |= {name: _innovations(health, tested) for name, tested in _tested(health).items()}
+    drawn |= {name: innovations_figure(health, tested) for name, tested in tested_by_figure(health).items()}
     if health.links:
         drawn["links"] = _links(health)
     return drawn
@@ -56,73 +61,14 @@ def _ordered(record: Record) -> list[str]:
     return sorted((node for node, filters in record.estimates.items() if filters), key=lambda node: node != FUSED)
 
 
-def _tested(health: Health) -> dict[str, list[FilterHealth]]:
-    """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
-    tested = sorted(
-        (filter for filter in health.filters if filter.white is not None), key=lambda item: item.node != FUSED
-    )
-    if len(tested) <= FEW:
-        return {"innovations": tested} if tested else {}
-    nodes: dict[str, list[FilterHealth]] = {}
-    for item in tested:
-        nodes.setdefault(item.node, []).append(item)
-    return {f"innovations_{i}": filters for i, filters in enumerate(list(nodes.values())[:MOST])}
-
-
-def _chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
-    """Return pictures by node one below the other, or as a choice where there are many."""
-    return (
-        [*pictures.values()]
-        if len(pictures) <= FEW
-        else [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
-    )
-
-
-def _not_drawn(names: Sequence[str], where: str) -> list[Text]:
-    """Return what a figure leaves out for lack of room, by name, and where its numbers are."""
-    if not names:
-        return []
-    return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
-
-
 @matplotlib.rc_context(LOOK)
 def _estimates(health: Health, record: Record, node: str) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(record.states)), layout="constrained")
     grid = figure.subplots(len(record.states), 1, squeeze=False, sharex=True)[:, 0]
     record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=list(grid), sigmas=BAND)
     legend_above(figure, grid[0])
-    _time_axis(health, grid[-1])
+    time_axis(health.record, grid[-1])
     return figure
-
-
-@matplotlib.rc_context(LOOK)
-def _innovations(health: Health, tested: list[FilterHealth]) -> Figure:
-    figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
-    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
-    names = _components(health)
-    for axes, item in zip(grid, tested, strict=True):
-        white = np.asarray(item.white)
-        # A colour for each output; of more outputs than colours, such as a centre's, one for all.
-        alike = white.shape[1] > len(COLOURS)
-        for i, component in enumerate(white.T):
-            name, colour = ("outputs", BLUE) if alike else (names[item.node][i], COLOURS[i])
-            label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
-            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
-        for level in (-BAND, BAND):
-            axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
-        axes.set_title(in_figure(f"{item.node}/{item.filter}"))
-        axes.set_ylabel("in deviations")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
-    _time_axis(health, grid[-1])
-    return figure
-
-
-def _components(health: Health) -> dict[str, list[str]]:
-    """Return the names of the measurement's components by node; of a central filter those of all nodes."""
-    names: dict[str, list[str]] = {}
-    for link in health.links:
-        names.setdefault(link.node, []).append(link.component)
-    return names | {FUSED: [f"{link.node}: {link.component}" for link in health.links]}
 
 
 @matplotlib.rc_context(LOOK)
@@ -139,13 +85,8 @@ def _links(health: Health) -> Figure:
     axes.set_yticks(range(len(links)), names)
     axes.set_ylim(len(links) - 0.5, -0.5)
     axes.grid(visible=False)
-    _time_axis(health, axes)
+    time_axis(health.record, axes)
     return figure
-
-
-def _time_axis(health: Health, axes: Axes) -> None:
-    units, dated = health.record.units, health.record.time.dtype.kind == "M"
-    axes.set_xlabel("time (UTC)" if dated else in_figure(f"time ({units['time']})" if "time" in units else "time"))
 
 
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
@@ -160,16 +101,6 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         ),
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
-    # Filtered estimates, then smoothed ones if there are any.
-    estimates: list[Picture | Choice] = []
-    for kind, item in _estimated(health):
-        added = ", given later data too" if kind == "smoothed" else ""
-        estimates += _chosen({
-            node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
-                          f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
-                          f"side{added}.")
-            for i, node in enumerate(_nodes(item))
-        })  # fmt: skip
     # Warnings are in the title and in the first section.
     return Page(
         kicker="Heliograph run",
@@ -184,22 +115,36 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
                 "Estimates",
                 [
                     *errors_table(record),
-                    *estimates,
-                    *_not_drawn(_ordered(record)[MOST:], "Their estimates are in the record."),
+                    *_pictures(health, drawings),
+                    *not_drawn(_ordered(record)[MOST:], "Their estimates are in the record."),
                 ],
             ),
-            Section("Innovations", [*_tests(health, drawings), *outputs_table(health)]),
+            innovations_section(health, drawings),
             Section("Links", _health(health, drawings)),
         ],
     )
 
 
+def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice]:
+    """Return the filtered estimates by node, then the smoothed ones if there are any."""
+    pictures: list[Picture | Choice] = []
+    for kind, record in _estimated(health):
+        added = ", given later data too" if kind == "smoothed" else ""
+        pictures += chosen({
+            node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
+                          f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
+                          f"side{added}.")
+            for i, node in enumerate(_nodes(record))
+        })  # fmt: skip
+    return pictures
+
+
 def errors_table(record: Record) -> list[Table]:
     """Return the errors of each filter where the recording has the true state."""
     rows = [
-        [visible(f"{item.node}/{item.filter}"), item.claim, *(f"{value:.4g}" for value in item.rmse.values()),
-         "–" if np.isnan(item.nees) else f"{item.nees:.3g}"]
-        for item in errors_of(record)
+        [visible(f"{errors.node}/{errors.filter}"), errors.claim, *(f"{value:.4g}" for value in errors.rmse.values()),
+         "–" if np.isnan(errors.nees) else f"{errors.nees:.3g}"]
+        for errors in errors_of(record)
     ]  # fmt: skip
     # What the columns are, in words.
     caption = (
@@ -223,8 +168,8 @@ def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
         return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
-    result = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
-    return f"Nothing is lost that the network says cannot be lost, and {result}."
+    tests = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
+    return f"Nothing is lost that the network says cannot be lost, and {tests}."
 
 
 def _counted(count: int, what: str) -> str:
@@ -242,7 +187,7 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
 
 
 def _by_name(health: Health) -> str:
-    names = [visible(f"{item.node}/{item.filter}") for item in health.doubted()]
+    names = [visible(f"{doubted.node}/{doubted.filter}") for doubted in health.doubted()]
     return f": {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}" if names else ""
 
 
@@ -251,76 +196,6 @@ def _compared(health: Health) -> list[Text | Points]:
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
-
-
-def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture | Choice]:
-    # One row for each filter, fused ones first: size, correlation and p-value of its innovations.
-    rows = []
-    for tested_filter in sorted(health.filters, key=lambda item: item.node != FUSED):
-        test, name = tested_filter.test, visible(f"{tested_filter.node}/{tested_filter.filter}")
-        if test is None:
-            rows.append([name, tested_filter.claim, "–", "–", "–"])
-        else:
-            size = f"{test.power:.2f} ± {1.96 * test.power_error:.2f}"
-            rows.append(
-                [
-                    name,
-                    tested_filter.claim,
-                    size,
-                    f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
-                    "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}",
-                ]
-            )
-    caption = (
-        "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
-        "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
-        "one row apart: 0 where the filter uses all that it receives. Both with 95 % intervals; **p**: probability of "
-        "such a correlation if there were none."
-    )
-    text = "An innovation is what arrived less what the filter expected. The tests need no true state."
-    # The innovations themselves, if any filter has some.
-    tested = _tested(health)
-    pictures = {
-        filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
-                                 f"Innovations in claimed standard deviations, one colour an output (of more than "
-                                 f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
-        for name, filters in tested.items()
-    }  # fmt: skip
-    drawn = {filter.node for filters in tested.values() for filter in filters}
-    left = [
-        f"{item.node}/{item.filter}" for item in health.filters if item.white is not None and item.node not in drawn
-    ]
-    table = Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
-    # Fusions of estimates, which are in no row.
-    listed = {(item.node, item.filter) for item in health.filters}
-    fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
-    if fusions:
-        text += (
-            f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
-            "fuses are tested here, and itself on the live page of `heliograph serve`."
-        )
-    return [Text([text]), table, *_chosen(pictures), *_not_drawn(left, "Their numbers are in the table.")]
-
-
-def outputs_table(health: Health) -> list[Table]:
-    """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
-    rows = []
-    for output in health.outputs:
-        # Numbers of the summary; the bias to the digits that its interval holds.
-        s = output.summary
-        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
-        half = (s.bias_high - s.bias_low) / 2
-        name = visible(f"{output.node}/{output.filter}: {output.output}")
-        bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
-        rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
-                     "to blame" if output.to_blame else ""])  # fmt: skip
-    caption = (
-        "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
-        "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
-        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its share "
-        "lies above that of the filter's other outputs together, by an interval of the difference."
-    )
-    return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
 
 
 def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
@@ -336,8 +211,8 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
-    not_drawn = _not_drawn(left, "Their numbers are in the table.")
-    return [Table(headers, rows), *picture, *not_drawn, *shared_text(health.shared)]
+    missing = not_drawn(left, "Their numbers are in the table.")
+    return [Table(headers, rows), *picture, *missing, *shared_text(health.shared)]
 
 
 def _moments(values: np.ndarray) -> tuple[str, str]:
@@ -347,14 +222,6 @@ def _moments(values: np.ndarray) -> tuple[str, str]:
     deviation = float(values.std())
     error = deviation / len(values) ** 0.5
     return rounded(float(values.mean()), error), rounded(deviation, error / 2**0.5)
-
-
-def rounded(value: float, error: float) -> str:
-    """Return a number to two digits of its standard error; to four of its own without one."""
-    if not (np.isfinite(value) and 0 < error < np.inf):
-        return f"{value:.4g}"
-    places = 1 - int(np.floor(np.log10(error)))
-    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
 def shared_text(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
@@ -385,10 +252,10 @@ def run_summary(health: Health) -> dict[str, Json]:
         outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.output] = output_numbers(output)
     # Errors, where the truth is known.
     errors: dict[str, dict[str, Json]] = {}
-    for item in errors_of(health.record):
-        size = None if np.isnan(item.nees) else item.nees
-        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in item.rmse.items()}
-        errors.setdefault(item.node, {})[item.filter] = {"rmse": rmse, "nees": size}
+    for of_filter in errors_of(health.record):
+        size = None if np.isnan(of_filter.nees) else of_filter.nees
+        rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
+        errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}
     # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:

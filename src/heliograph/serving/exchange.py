@@ -27,7 +27,7 @@ class Exchange:
 
     def __init__(self, fleet: Fleet, moment: Moment):
         self.fleet, self._moment = fleet, moment
-        nodes = {name: item for name, item in fleet.network.fused.items() if isinstance(item, NodeFilter)}
+        nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
         self._name = next(iter(nodes), "")
         self._node = nodes.get(self._name)
 
@@ -56,15 +56,15 @@ class Exchange:
     def _measured(self, events: Iterable[tuple[int, int, float]]) -> bool:
         """Test whether a row has the node's measurement, or anything where the node has no sensor."""
         assert self._node is not None
-        return any(place == 0 or (place > 0 and not self._node.measured[0]) for place, _, _ in events)
+        return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
     def _sent(self, plant: Plant, row: HeldRow) -> list[Output]:
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])
-        before = central[self._name].before
+        mean, covariance = self._node.sent(central[self._name].before)
         measurement = row.numbers[: self._node.measured[0]]
-        values = np.concatenate([before.mean[0], np.ravel(before.covariance[0]), measurement]).tolist()
+        values = np.concatenate([mean, np.ravel(covariance), measurement]).tolist()
         time = int(row.key[0])
         message = {"plant": plant.name, "node": network.names[0], "sequence": time, "values": values}
         body = to_json(message | {"time": self._moment(plant, row.key[0])}, inf_nan_mode="null")

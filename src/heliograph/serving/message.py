@@ -79,12 +79,12 @@ def read_message(payload: bytes) -> Message:
         return _READER.validate_json(payload)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        part = str(first["loc"][0]) if first["loc"] else ""
-        if part not in EXPECTED:  # no JSON object, or one with a field more
+        field = str(first["loc"][0]) if first["loc"] else ""
+        if field not in EXPECTED:  # no JSON object, or one with a field more
             fields = f"a JSON object with no fields but {', '.join(EXPECTED)}"
-            raise fail("message", fields, shown(part) if part else _what(payload)) from None
+            raise fail("message", fields, shown(field) if field else _what(payload)) from None
         came = "no such field" if first["type"] == "missing" else shown(first["input"])
-        raise fail(f"message, {part}", EXPECTED[part], came) from None
+        raise fail(f"message, {field}", EXPECTED[field], came) from None
 
 
 def _what(payload: bytes) -> str:
@@ -94,8 +94,8 @@ def _what(payload: bytes) -> str:
     except RecursionError:
         return "brackets nested too deeply"
     except ValueError as error:
-        place = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
-        return f"{shown(payload)}, which is no JSON{place}"
+        where = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
+        return f"{shown(payload)}, which is no JSON{where}"
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:

@@ -89,8 +89,8 @@ def _nis(watch: Watch) -> Iterable[Metric]:
     )
     low = GaugeMetricFamily("heliograph_nis_low", "Least that is expected of an honest filter.", labels=labels)
     high = GaugeMetricFamily("heliograph_nis_high", "Most that is expected of an honest filter.", labels=labels)
-    for key, item in watch.nis.items():
-        for metric, value in zip((ratio, low, high), (item.ratio, *item.band()), strict=True):
+    for key, nis in watch.nis.items():
+        for metric, value in zip((ratio, low, high), (nis.ratio, *nis.band()), strict=True):
             metric.add_metric(list(key), value)
     return ratio, low, high
 
@@ -109,11 +109,11 @@ def _outputs(watch: Watch) -> Iterable[Metric]:
         for name, words in what.items()
     }
     # Numbers of each output of each filter that weighs; none where there are too few rows.
-    for item in watch.outputs.health():
-        numbers = output_numbers(item)
+    for output in watch.outputs.health():
+        numbers = output_numbers(output)
         for name, metric in metrics.items():
             if isinstance(value := numbers[name], float):
-                metric.add_metric([item.node, item.filter, item.output], value)
+                metric.add_metric([output.node, output.filter, output.output], value)
     return metrics.values()
 
 
@@ -138,16 +138,16 @@ class Door(NamedTuple):
     token: str | None
 
 
-def door(place: str, environment: Mapping[str, str] | None = None) -> Door:
+def door(address: str, environment: Mapping[str, str] | None = None) -> Door:
     """`PORT`, of this machine alone, or `ADDRESS:PORT`, which takes a token from HELIOGRAPH_PAGE_TOKEN.
 
     Raises:
-        ValueError: no such place; one that others can reach without a token of at least 16 characters.
+        ValueError: no such address; one that others can reach without a token of at least 16 characters.
     """
-    host, _, port = place.rpartition(":")
+    host, _, port = address.rpartition(":")
     host = host.strip("[]") or "127.0.0.1"
     if not (port.isascii() and port.isdigit() and int(port) < 65536):
-        raise fail("page", "a port, or address:port", repr(place))
+        raise fail("page", "a port, or address:port", repr(address))
     if _is_loopback(host):
         return Door(host, int(port), None)
     token = (os.environ if environment is None else environment).get(TOKEN, "")

@@ -197,8 +197,8 @@ def of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
 
 def name_of(network: str) -> str:
     """Return the name of a network: of `my_network.py` or of a module, and of the one among several there."""
-    place, _, name = network.rpartition(":")
-    file, name = (place, f"-{name}") if name.isidentifier() and place else (network, "")
+    prefix, _, name = network.rpartition(":")
+    file, name = (prefix, f"-{name}") if name.isidentifier() and prefix else (network, "")
     stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]
     return f"{stem}{name}"
 
@@ -298,7 +298,7 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
     from heliograph.serving.storage.leases import Leases
     from heliograph.serving.storage.store import Store
 
-    place, broker = str(settings.store), settings.broker
+    store_name, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked
     fleet = Fleet(lanes, settings.options)
     # Check the store once, before any part is served.
@@ -309,7 +309,7 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
 
     async def serve(number: int, stop: asyncio.Event) -> None:
         # The journal of a part continues with whichever process serves it.
-        store = Store(place, mine, f"part {number} of {parts}", opened=first)
+        store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
             service = look(Service(Fleet(lanes, settings.options), store, _say))
             await serve_until(stop, service, connected(broker, Part(number, parts)))
@@ -318,7 +318,7 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
 
     # Lease parts under a name that is unique to this process.
     name = settings.process or f"{socket.gethostname()} {os.getpid()}"
-    engine = engine_at(place)
+    engine = engine_at(store_name)
     try:
         await keep_sharing(Leases(engine, name, parts), serve)
     finally:

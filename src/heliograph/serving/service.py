@@ -16,8 +16,8 @@ from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
+from heliograph.live.lanes import FilterColumns, WeighedAt
 from heliograph.live.lanes import Lanes as Lanes
-from heliograph.live.lanes import Place, WeighedAt
 from heliograph.live.plant import Plant
 from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.senders import SenderStatus
@@ -34,16 +34,16 @@ class OutputWriter:
 
     def __init__(self, lanes: Lanes):
         self._n = len(lanes.network.states)
-        self._nodes: dict[str, list[Place]] = {}
-        for place in lanes.places:
-            self._nodes.setdefault(place.node, []).append(place)
+        self._nodes: dict[str, list[FilterColumns]] = {}
+        for columns in lanes.places:
+            self._nodes.setdefault(columns.node, []).append(columns)
 
     def estimates(
         self, kind: str, plant: str, time: float | str, outputs: list[float], senders: Mapping[str, SenderStatus]
     ) -> bytes:
         """Return a line with the estimates of all filters after a row, from its outputs, and the senders."""
         results = {
-            node: {place.filter: self._filter(place, outputs) for place in places}
+            node: {columns.filter: self._filter(columns, outputs) for columns in places}
             for node, places in self._nodes.items()
         }
         parts: dict[str, object] = {"kind": kind, "plant": plant, "time": time, "estimates": results}
@@ -51,22 +51,22 @@ class OutputWriter:
             parts["senders"] = {name: status._asdict() | {"dead": status.dead} for name, status in senders.items()}
         return line(parts)
 
-    def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
-        n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
+    def _filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+        n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
         # Estimate, without a claim where it is no number.
-        covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
+        covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
         numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
-        negative = place.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
-        claim = place.claim if numbers and not negative else "none"
+        negative = columns.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
+        claim = columns.claim if numbers and not negative else "none"
         results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
         # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
-        if place.tested is not None:
-            nis, received = (outputs[column] for column in place.tested)
+        if columns.tested is not None:
+            nis, received = (outputs[column] for column in columns.tested)
             return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
         if judged is None:
             return results
-        if place.weighed is not None:
-            parts = zip(WeighedAt._fields, place.weighed, strict=True)
+        if columns.weighed is not None:
+            parts = zip(WeighedAt._fields, columns.weighed, strict=True)
             results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
         if outputs[judged.reason] > 0:
             why = in_words(outputs[judged.reason], outputs[judged.distance])
@@ -233,7 +233,7 @@ class Service:
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
         entries += self._finals(finalised)
-        provisional = self._provisional([item for item in finalised if item.plant.name in used])
+        provisional = self._provisional([row for row in finalised if row.plant.name in used])
         self.fleet.forget(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
@@ -275,16 +275,16 @@ class Service:
     def _load(self, names: Iterable[str]) -> None:
         """Load the plants of these names from the store, if it keeps any."""
         self._damage = {}
-        for name, item in self.store.load([name for name in names if name not in self.plants]).items():
-            if item.damage:
-                self._damage[name] = item.damage
+        for name, stored in self.store.load([name for name in names if name not in self.plants]).items():
+            if stored.damage:
+                self._damage[name] = stored.damage
                 continue
-            plant = self.plants[name] = plant_from(name, item.body, self.fleet)
-            plant.version = item.version
+            plant = self.plants[name] = plant_from(name, stored.body, self.fleet)
+            plant.version = stored.version
 
     def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
-        rows = [(item.plant, row) for item in finalised for row in item.final if row.has_data()]
+        rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
         outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [
             Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
@@ -293,7 +293,7 @@ class Service:
 
     def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
         """Return the provisional estimates at the newest rows."""
-        outputs = self.fleet.outputs([item.newest.slot for item in finalised])
+        outputs = self.fleet.outputs([row.newest.slot for row in finalised])
         return [
             Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
             for (plant, _, newest, _), numbers in zip(finalised, outputs, strict=True)

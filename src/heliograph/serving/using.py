@@ -62,25 +62,25 @@ class Using:
             self._before, self._taken = {}, []
             for i in left:
                 outcomes[i] = self._outcome(i, messages[i])
-            self.fleet.step(list({item.plant.name: item.plant for item in self._taken}.values()))
-            result = self._judges.implausible(self._taken)
+            self.fleet.step(list({candidate.plant.name: candidate.plant for candidate in self._taken}.values()))
+            implausible = self._judges.implausible(self._taken)
             # Plants that an implausible message has spoilt go back.
             spoilt = set()
-            for i, why in result.items():
+            for i, why in implausible.items():
                 number, plant, event, _ = self._taken[i]
-                self._refused[number, event.place < 0] = why
+                self._refused[number, event.node_index < 0] = why
                 spoilt.add(plant.name)
             for name in spoilt:
                 self._undo(name)
-            left = [i for i in left if isinstance(item := messages[i], Message) and item.plant in spoilt]
+            left = [i for i in left if isinstance(message := messages[i], Message) and message.plant in spoilt]
         return [outcomes[i] for i in range(len(messages))]
 
     def _implausible_inputs(self, messages: Sequence[Message | str]) -> dict[tuple[int, bool], str]:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
         given = [(i, message, message.values if message.node == INPUTS else message.inputs)
                  for i, message in enumerate(messages) if isinstance(message, Message)]  # fmt: skip
-        given = [(i, item, values) for i, item, values in given if values and len(values) == self.fleet.lanes.given]
-        plants = [self.plants.get(item.plant) for _, item, _ in given]
+        given = [(i, m, values) for i, m, values in given if values and len(values) == self.fleet.lanes.given]
+        plants = [self.plants.get(message.plant) for _, message, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
         why = self._judges.implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
@@ -106,7 +106,7 @@ class Using:
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
         # Values beyond limits do not count as received; an event of such values only is implausible.
         event, dropped, beyond = self._within(message.node, event)
-        why = self._refused.get((number, event.place < 0)) or (beyond if np.isnan(event.values).all() else "")
+        why = self._refused.get((number, event.node_index < 0)) or (beyond if np.isnan(event.values).all() else "")
         spoilt = self._refused.get((number, True)) if inputs is not None else None
         if plant is None:
             if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock

@@ -166,13 +166,13 @@ class Watch:
                     self._test(output.plant, message["estimates"])
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        local = _newest(self._tests, plant, dict)
+        of_plant = _newest(self._tests, plant, dict)
         recent = self.outputs, _newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
         for node, filters in estimates.items():
             for name, message in filters.items():
                 if message.get("nis") is not None:
-                    for item in (self.nis, local):
-                        single = item.setdefault((node, name), RunningNis(message["claim"]))
+                    for tests in (self.nis, of_plant):
+                        single = tests.setdefault((node, name), RunningNis(message["claim"]))
                         single.add(message["nis"], message["received"])
                 if message.get("outputs") and message.get("received"):
                     for outputs in recent:
@@ -210,7 +210,7 @@ class Watch:
         with self.lock:
             # Plants by name may be in several services: counts are summed.
             name = next(reversed(self._points), "") if plant is None else plant
-            results = [item for known, item in self.plants() if known == name]
+            results = [status for known, status in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests, senders = self._tests.get(name, {}), self._senders.get(name, {})
             health = self._outputs[name].health() if name in self._outputs else []
@@ -230,22 +230,22 @@ class Watch:
                 "links": _added(results),
                 "senders": senders,
                 "tests": [_test_row(*key, test) for key, test in tests.items()] + self.fused_rows(tests),
-                "outputs": [output_row(item) for item in health],
+                "outputs": [output_row(output) for output in health],
                 "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
-                "all": _added(item for _, item in self.plants()),
+                "all": _added(status for _, status in self.plants()),
             }
 
     def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
         """Return the check of each fusion of estimates that has no test of itself, by the claims of what it fuses."""
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():
-            known = [(part, tests[part]) for part in parts if part in tests]
-            doubted = ["/".join(part) for part, test in known if test.doubt()]
+            known = [(source, tests[source]) for source in parts if source in tests]
+            doubted = ["/".join(source) for source, test in known if test.doubt()]
             numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in known)}
-            local = {"doubt": bool(doubted), "by": doubted or ["/".join(part) for part, _ in known]}
+            judged = {"doubt": bool(doubted), "by": doubted or ["/".join(source) for source, _ in known]}
             if known and (FUSED, name) not in tests:  # else it has a test of itself
-                rows.append({"node": FUSED, "filter": name, "claim": claim, **numbers, **local})
+                rows.append({"node": FUSED, "filter": name, "claim": claim, **numbers, **judged})
         return rows
 
     def _warnings(
@@ -293,14 +293,14 @@ class Watched:
             return self.service.finish(ended)
 
 
-def _newest(result: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
+def _newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
     """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond PLANTS."""
-    if plant not in result:
-        result[plant] = make()
-        if len(result) > PLANTS:
-            result.popitem(last=False)
-    result.move_to_end(plant)
-    return result[plant]
+    if plant not in newest:
+        newest[plant] = make()
+        if len(newest) > PLANTS:
+            newest.popitem(last=False)
+    newest.move_to_end(plant)
+    return newest[plant]
 
 
 def _band(message: Mapping[str, Any]) -> dict[str, object]:
@@ -325,10 +325,10 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
     return results
 
 
-def _test_row(node: str, filter_name: str, item: RunningNis) -> dict[str, object]:
-    low, high = item.band()
-    names = {"node": node, "filter": filter_name, "claim": item.claim, "doubt": item.doubt() is not None, "by": []}
-    return names | {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
+def _test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
+    low, high = test.band()
+    names = {"node": node, "filter": filter_name, "claim": test.claim, "doubt": test.doubt() is not None, "by": []}
+    return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}
 
 
 def watch_of(network: Network, title: str) -> Watch:
@@ -340,8 +340,8 @@ def watch_of(network: Network, title: str) -> Watch:
         if isinstance(fusion, Fusion)
     }
     names: dict[tuple[str, str], Sequence[str]] = {
-        (node, name): place.received_names for node, place in network.nodes.items() for name in place.filters
+        (node, name): receiver.received_names for node, receiver in network.nodes.items() for name in receiver.filters
     }
-    all_names = [f"{node}: {name}" for node, place in network.nodes.items() for name in place.received_names]
+    all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
     names |= {(FUSED, name): all_names for name in network.fused}
     return Watch(network.states, title, "s" if TIME_STEP in network.inputs else "steps", fused, names)

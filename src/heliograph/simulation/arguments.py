@@ -34,5 +34,5 @@ def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np
     """
     flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
     shape = (steps,) if flat else (steps, received)
-    result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
-    return result[:, None] if flat else result
+    values: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
+    return values[:, None] if flat else values

@@ -47,11 +47,11 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (steps, m), and the delay of each (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
-    item = at(channel, 0) if isinstance(channel, OverTime) else channel
-    if item is None or not item.past:
+    link = at(channel, 0) if isinstance(channel, OverTime) else channel
+    if link is None or not link.past:
         return z, np.zeros(len(z))
-    if isinstance(item, Delayed) and item.timestamped:
+    if isinstance(link, Delayed) and link.timestamped:
         return z[:, :-1], z[:, -1]
-    if isinstance(item, Delayed) and item.constant:
-        return z, np.full(len(z), float(item.past))
+    if isinstance(link, Delayed) and link.constant:
+        return z, np.full(len(z), float(link.past))
     raise fail(f"delays of node {name!r}", "constant ones, or time stamps", "random ones without time stamps")

@@ -79,9 +79,12 @@ def certify_boundedness(network: Network) -> Boundedness:
     Impossible: rho(chain within the modes that do not observe an eigenvector) |eigenvalue|^2 >= 1. Where losses alone
     are random, and noises Gaussian, that is true of every filter; a nonlinear filter may identify a hidden mode.
 
+    Args:
+        network: linear, of nodes that receive their sensors over channels that do not vary.
+
     Raises:
-        ValueError: a plant, sensor or channel that varies or is not linear, relays that filter, too many sets of
-            losses.
+        ValueError: a plant, sensor or channel that varies or is not linear, a channel that delivers late, relays that
+            filter, too many sets of losses.
 
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
@@ -131,6 +134,8 @@ def _links(network: Network, states: int) -> Links:
 def _constant(channel: Channel) -> AbstractRandomAffine:
     if isinstance(channel, OverTime):
         raise fail("boundedness", "channels that do not vary", "one that varies")
+    if channel.past:
+        raise fail("boundedness", "channels without delays", f"one that is late by up to {channel.past} steps")
     return channel
 
 
@@ -150,16 +155,16 @@ class KnownLosses(NamedTuple):
     @property
     def exact(self) -> bool:
         """True where nothing that arrives is left out."""
-        return all(part.exact for part in self.parts)
+        return all(outcome.exact for outcome in self.parts)
 
     @property
     def random(self) -> bool:
         """True where random gains make something unusable."""
-        return any(part.random for part in self.parts)
+        return any(outcome.random for outcome in self.parts)
 
     def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
         """Gains on what arrives, from those on its sums of known gain."""
-        return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
+        return {kind: k @ outcome.combine for kind, k, outcome in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
@@ -180,7 +185,7 @@ def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.nd
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(parts[s].noise(o, links) for _, o, s in weights)
-    system = KnownLossSystem(a, q, chain, law, values, tuple(part.rows for part in parts), noises)
+    system = KnownLossSystem(a, q, chain, law, values, tuple(outcome.rows for outcome in parts), noises)
     return KnownLosses(system, kinds, parts)
 
 

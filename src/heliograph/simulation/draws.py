@@ -1,4 +1,4 @@
-"""Random keys by run, step, place and purpose, so that no draw depends on the others."""
+"""Random keys by run, step, source and purpose, so that no draw depends on the others."""
 
 from zlib import crc32
 
@@ -19,10 +19,10 @@ def seed_key(seed: int) -> jax.Array:
     return key
 
 
-def draw_key(run_key: jax.Array, k: Number, place: Number, purpose: int) -> jax.Array:
-    """Key of one draw: folded in by step, place and purpose, so no draw depends on how many others there are."""
-    for part in (k, place, purpose):
-        run_key = jax.random.fold_in(run_key, part)
+def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax.Array:
+    """Key of one draw: folded in by step, source and purpose, so no draw depends on how many others there are."""
+    for number in (k, source, purpose):
+        run_key = jax.random.fold_in(run_key, number)
     return run_key
 
 

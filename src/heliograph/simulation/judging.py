@@ -22,19 +22,19 @@ RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 
 def implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
     """Test whether some filter judges its measurement implausible."""
-    items = [jnp.any(item.implausible) for item in (*outputs["judged"], *outputs["judged_centrally"].values())]
+    items = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
     return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
     """Test the same of stored results."""
-    return any((item.reason > 0).any() for item in (*outputs["judged"], *outputs["judged_centrally"].values()))
+    return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
 def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """Reason of each filter not to use its measurement, by kind and by name."""
-    return [item.reason for item in outputs["judged"]], {
-        n: item.reason for n, item in outputs["judged_centrally"].items()
+    return [judgement.reason for judgement in outputs["judged"]], {
+        n: judgement.reason for n, judgement in outputs["judged_centrally"].items()
     }
 
 
@@ -48,8 +48,8 @@ def step_without(
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
     """Repeat a step, where each filter skips what it judged implausible the first time."""
-    after, result = filters.step(states, z, u, k, drawn, reasons(first[1]))
-    return after, result | {name: first[1][name] for name in ("judged", "judged_centrally")}
+    after, outputs = filters.step(states, z, u, k, drawn, reasons(first[1]))
+    return after, outputs | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
 
 def plausible_step(
@@ -62,10 +62,10 @@ def plausible_step(
 ) -> Stepped:
     """Step all filters without implausible data; the second step is taken only where some is."""
     first = filters.step(states, z, u, k, drawn)
-    result: Stepped = jax.lax.cond(
+    stepped: Stepped = jax.lax.cond(
         implausible(first[1]), lambda: step_without(filters, first, states, z, u, k, drawn), lambda: first
     )
-    return result
+    return stepped
 
 
 class Judges:
@@ -73,9 +73,9 @@ class Judges:
 
     def __init__(self, network: Network):
         self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
-        for (node, name), place in network.places().items():
+        for (node, name), position in network.places().items():
             if network.nodes[node].filters[name].received:
-                self._places[node].append(place)
+                self._places[node].append(position)
 
     def of_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of the filters that receive from a node; where it has none, of the central ones."""
@@ -83,14 +83,14 @@ class Judges:
 
     def of_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """Judgements of all filters."""
-        places = [(k, f, i) for k, item in enumerate(outputs["judged"]) for f, i in np.ndindex(*item[0].shape[-2:])]
+        places = [(k, f, i) for k, j in enumerate(outputs["judged"]) for f, i in np.ndindex(*j[0].shape[-2:])]
         return self._rows(outputs, places, True)
 
     def _rows(
         self, outputs: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        items = [[part[..., f, i] for part in outputs["judged"][k]] for k, f, i in places]
-        items += [list(item) for item in outputs["judged_centrally"].values()] if central else []
+        items = [[field[..., f, i] for field in outputs["judged"][k]] for k, f, i in places]
+        items += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
         if not items:
             return np.zeros((0, len(Judgement._fields)))
         return np.moveaxis(np.array(items), (0, 1), (-2, -1))
@@ -98,25 +98,25 @@ class Judges:
 
 def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
     """Rows of a recording that are implausible, by node, each with its reason."""
-    judges, result = Judges(network), dict[str, dict[int, str]]()
+    judges, refused = Judges(network), dict[str, dict[int, str]]()
     for name in network.names:
         votes = judges.of_node(outcome, name)
         bad = _flagged(votes, "reason")
         why = {k: said for k in bad if (said := why_values(votes[k]))}
         if why:
-            result[name] = why
-    return result
+            refused[name] = why
+    return refused
 
 
 def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
     """Messages about a recording: rows that are implausible, or to one filter alone, and inputs."""
     # Rows that are implausible for all filters of a node.
-    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, item in refused.items()
-             for rows, why in [(list(item), next(iter(item.values())))]]  # fmt: skip
+    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, by_row in refused.items()
+             for rows, why in [(list(by_row), next(iter(by_row.values())))]]  # fmt: skip
     # Rows that a single filter skips.
-    items = {(node, name): [part[:, f, i] for part in outputs["judged"][kind]]
+    items = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
             for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
-    every = {(FUSED, name): list(item) for name, item in outputs["judged_centrally"].items()}
+    every = {(FUSED, name): list(judgement) for name, judgement in outputs["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
     for (node, name), (distance, _, reason, _) in (items | every).items():
         known = all_rows if node == FUSED else refused.get(node, {})
@@ -132,11 +132,11 @@ def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str
     return lines
 
 
-def _flagged(votes: Float[np.ndarray, "steps filters 4"], part: str) -> list[int]:
+def _flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
     """Rows that some filter flags."""
     if not votes.size:
         return []
-    results: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(part)] > 0).any(axis=-1)).tolist()
+    results: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
     return results
 
 
@@ -160,7 +160,7 @@ def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps recei
     if channel.erases or channel.remembers or channel.outputs != len(node.outputs):
         return []
     # Each value against the one before it.
-    result, last = list[int](), None
+    forbidden, last = list[int](), None
     for k, row in enumerate(z[:, : len(node.outputs)]):
         if np.isnan(row).any():
             continue
@@ -170,6 +170,6 @@ def forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps recei
             delta = (1 - RIM) * np.asarray(trigger.delta)
             inside = np.linalg.norm(error) <= delta if trigger.region == "ball" else np.all(error <= delta)
             if inside and not due:
-                result.append(k)
+                forbidden.append(k)
         last = k
-    return result
+    return forbidden

@@ -56,7 +56,7 @@ class AbstractMedium(Module):
 class NodeGroup(Module):
     """Sensors and channels of a group of nodes, stacked; checksums of the names identify their draws.
 
-    `reference_filter`: the filters that are fed back to the sensors; their estimates stand at `place` (kind, filter).
+    `reference_filter`: filters that are fed back to the sensors; their estimates stand at `informed_at` (kind, filter).
 
     `trigger`: when they send; its prediction is that of a filter too, the `reference_filter`.
 
@@ -69,14 +69,14 @@ class NodeGroup(Module):
     memories: jax.Array | np.ndarray
     reference_filter: FedBackFilter | EventFilter | StochasticEventFilter | None
     trigger: AbstractTrigger | None
-    place: tuple[int, int] | None = eqx.field(static=True)
+    informed_at: tuple[int, int] | None = eqx.field(static=True)
 
 
 class Silent(Module):
     """Nodes without a sensor."""
 
     count: int = eqx.field(static=True)
-    place: None = eqx.field(static=True, default=None)
+    informed_at: None = eqx.field(static=True, default=None)
 
 
 class LinkState(NamedTuple):
@@ -139,7 +139,9 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Feed the present estimate of each filter back to its sensor."""
         return tuple(
-            reach if group.place is None else reach._replace(feed_back=estimates[group.place[0]].mean[group.place[1]])
+            reach
+            if group.informed_at is None
+            else reach._replace(feed_back=estimates[group.informed_at[0]].mean[group.informed_at[1]])
             for group, reach in zip(self.groups, state, strict=True)
         )
 
@@ -173,9 +175,9 @@ class CommonChannel(AbstractMedium):
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, ObservationModel]:
         """Measure x and deliver through the channel."""
-        sensor, place = at(self.sensor, k), checksum(SENDER)
-        y = sensed(sensor, x, draw_key(key, k, place, SENSOR))
-        state, z = deliver(self.channel, state, y, key, k, place, ())
+        sensor, source = at(self.sensor, k), checksum(SENDER)
+        y = sensed(sensor, x, draw_key(key, k, source, SENSOR))
+        state, z = deliver(self.channel, state, y, key, k, source, ())
         return state, tuple(z[rows] for rows in self.rows)
 
 
@@ -190,10 +192,12 @@ class Slots(AbstractMedium):
     """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
 
     A hop with memory moves on at every step, used or not; the same pair in another slot is another hop.
+
+    `estimates_at`: kind, filter and node of each relay's estimate.
     """
 
     relays: RelayNetwork
-    local: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
+    estimates_at: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
     memories: dict[str, np.ndarray]  # places of the memories of each hop that has some
 
@@ -204,7 +208,7 @@ class Slots(AbstractMedium):
             name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
             for name, (_, listener, sender, hop) in _remembering(self.relays).items()
         }
-        return Relayed(jnp.tile(mean, (len(self.local), 1)), hops)
+        return Relayed(jnp.tile(mean, (len(self.estimates_at), 1)), hops)
 
     def receive(
         self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
@@ -219,15 +223,15 @@ class Slots(AbstractMedium):
         received = self._forgetful(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
         for name, (number, listener, sender, hop) in _remembering(self.relays).items():
-            place = checksum(f"{sender} to {listener}")
-            hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, place, self.memories[name])
+            source = checksum(f"{sender} to {listener}")
+            hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, source, self.memories[name])
             received[listener] = received[listener] + jnp.where(slot == number, z, 0.0)
         order = [received[name] for name in self.relays.filters]
         return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
 
     def feed_back(self, state: Relayed, estimates: Sequence[Estimate]) -> Relayed:
         """Store the relays' estimates, to be sent at the next step."""
-        means = [estimates[kind].mean[f, i] for kind, f, i in self.local]
+        means = [estimates[kind].mean[f, i] for kind, f, i in self.estimates_at]
         return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
 
     def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
@@ -319,10 +323,10 @@ def medium_of(network: Network) -> AbstractMedium:
         reference_filter: PyTree = (
             None if informed_by is None else stack([nodes[name].filters[informed_by] for name in names])
         )
-        place = None if informed_by is None else places[names[0], informed_by][:2]
+        informed_at = None if informed_by is None else places[names[0], informed_by][:2]
         triggers: PyTree = [nodes[name].trigger for name in names]
         trigger = None if triggers[0] is None else stack(triggers)
-        groups.append(NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, place))
+        groups.append(NodeGroup(*stacked, checksums, memory_rows, reference_filter, trigger, informed_at))
     return SeparateChannels(tuple(groups))
 
 

@@ -102,7 +102,7 @@ class Network(Module):
         self.meshes = {
             name: fusion for name, fusion in fusions.items() if isinstance(fusion, Fusion) and fusion.neighbours
         }
-        self.fused = {name: item for name, item in fusions.items() if name not in self.meshes}
+        self.fused = {name: fusion for name, fusion in fusions.items() if name not in self.meshes}
         self.names = tuple(self.nodes)
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
@@ -176,18 +176,18 @@ class Network(Module):
         # Each relay runs its schedule.
         filters: dict[str, dict[str, AbstractFilter]] = {}
         n = len(relays.states)
-        for name, item in zip(relays.relays, relays.received, strict=False):
+        for name, size in zip(relays.relays, relays.received, strict=False):
             shape = schedules[name].gains.direct.shape[1:]
-            if shape != (n, item):
-                raise fail(f"schedule of {name!r}", f"gains of shape {(n, item)}", f"shape {shape}")
+            if shape != (n, size):
+                raise fail(f"schedule of {name!r}", f"gains of shape {(n, size)}", f"shape {shape}")
             filters[name] = {LOCAL: ScheduledFilter(schedules[name])}
         filters[RECEIVER] = dict(receivers)
         check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
         # All places receive sums of hops.
         nodes = {
-            name: ReceivingNode(filters[name], item, outputs, relays.always_receives(name))
-            for name, item in zip(relays.filters, relays.received, strict=True)
+            name: ReceivingNode(filters[name], size, outputs, relays.always_receives(name))
+            for name, size in zip(relays.filters, relays.received, strict=True)
         }
         return Network(relays.plant, nodes, relays=relays)
 
@@ -217,7 +217,7 @@ class Network(Module):
         check_forgets("channel of nodes that share it", first(channel))
         # Each output goes to one node.
         received = {
-            name: max((item.received for item in by_name.values()), default=0) for name, by_name in filters.items()
+            name: max((filter.received for filter in by_name.values()), default=0) for name, by_name in filters.items()
         }
         if sum(received.values()) != first(channel).outputs:
             raise fail(
@@ -318,9 +318,9 @@ class Network(Module):
 
     def in_single_precision(self) -> "Network":
         """Return the network for single precision: the lost digits are not bounded, so that all claims are lowered."""
-        result = copy(self)
-        object.__setattr__(result, "single", True)
-        return result
+        lowered = copy(self)
+        object.__setattr__(lowered, "single", True)
+        return lowered
 
     def _fused_claim(self, fusion: Fusion | AbstractFilter) -> Claim:
         if isinstance(fusion, AbstractFilter):
@@ -329,12 +329,12 @@ class Network(Module):
         # A rule that needs nothing but the estimates.
         if not isinstance(fusion.rule, AbstractInformedFusion):
             return fusion.claim([claim_at(self.nodes[n], self.nodes[n].filters[fusion.filter]) for n in names])
-        rule, local = type(fusion.rule).__name__, {n: self.nodes[n] for n in names}
+        rule, nodes = type(fusion.rule).__name__, {n: self.nodes[n] for n in names}
         if fusion.quantizer is not None and not fusion.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
         # An informed rule: it needs the joint moments of the errors.
         known = self.parts_of(fusion.filter)
-        if len(known) < len(local):
+        if len(known) < len(nodes):
             raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
         if (fusion.by_report or fusion.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
@@ -342,13 +342,13 @@ class Network(Module):
         claim = informed_claim(rule, self.plant, known, self.common is not None)
         if not fusion.by_report:
             return claim
-        return reported_claim(rule, claim, fusion, {n: node.complete for n, node in local.items()})
+        return reported_claim(rule, claim, fusion, {n: node.complete for n, node in nodes.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Sensor, channel and the filter `name` of each node that has it and receives a sensor through a channel."""
-        local = {node: self.nodes[node] for node in self.nodes_with(name)}
-        worlds = {n: v if isinstance(v, Node) else self.common for n, v in local.items()}
-        return {n: (w.sensor, w.channel, local[n].filters[name]) for n, w in worlds.items() if w is not None}
+        nodes = {node: self.nodes[node] for node in self.nodes_with(name)}
+        worlds = {n: v if isinstance(v, Node) else self.common for n, v in nodes.items()}
+        return {n: (w.sensor, w.channel, nodes[n].filters[name]) for n, w in worlds.items() if w is not None}
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
@@ -381,6 +381,6 @@ def lowered(claims: Claims) -> Claims:
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
     """Group names by the structure of their items, in order of first appearance."""
     results: dict[object, list[str]] = {}
-    for name, item in items:
-        results.setdefault(structure(item), []).append(name)
+    for name, described in items:
+        results.setdefault(structure(described), []).append(name)
     return tuple(tuple(names) for names in results.values())

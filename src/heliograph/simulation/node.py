@@ -33,7 +33,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
     Raises:
         ValueError: a flag of another step; no flag where a filter uses the mode.
     """
-    rows = [part for channel in channels for part in _rows(channel)]
+    rows = [row for channel in channels for row in _rows(channel)]
     # Flags stand after the measurement; each comes from one row of the channels.
     for reader in _readers(filter):
         if isinstance(reader, ModeObservedFilter):
@@ -41,7 +41,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
             wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
         else:
             expected = "hg.model.with_flag(link, flags)"
-            wrong = [part for part in rows[reader.received - 1 : reader.received] if isinstance(part, OneStepLate)]
+            wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
         if wrong:
             late = isinstance(wrong[0], OneStepLate)
             plain = "one of this step" if isinstance(wrong[0], ModeOutput) else f"{type(wrong[0]).__name__}, no mode"
@@ -51,7 +51,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
 def _readers(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Filters that use flags, after the measurement in the received vector; also inside of others."""
     kinds = SideInformationFilter, ModeObservedFilter
-    leaves = jax.tree.leaves(filter, is_leaf=lambda part: isinstance(part, kinds))
+    leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
     return [
         leaf
         for leaf in leaves
@@ -68,10 +68,10 @@ def _rows(channel: AbstractRandomAffine) -> Iterator[AbstractRandomAffine]:
         yield from [channel] * channel.outputs
 
 
-def _reveals(part: AbstractRandomAffine, late: bool) -> bool:
+def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:
     if late:
-        return isinstance(part, OneStepLate) and isinstance(part.base, ModeOutput)
-    return isinstance(part, ModeOutput)
+        return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
+    return isinstance(affine, ModeOutput)
 
 
 @readable
@@ -123,8 +123,8 @@ class Node(Module):
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid)
         # Side information of the right step; feedback to one filter alone.
-        for name, item in self.filters.items():
-            check_flags(f"filter {name!r}", item, [first(channel)])
+        for name, filter in self.filters.items():
+            check_flags(f"filter {name!r}", filter, [first(channel)])
         observation = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and observation != [self.informed_by]:
             raise fail(
@@ -238,7 +238,7 @@ def check_trigger(
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(
-        isinstance(item, AbstractFilter) and _predicts(item, trigger) for item in filters.values()
+        isinstance(filter, AbstractFilter) and _predicts(filter, trigger) for filter in filters.values()
     ):
         raise fail("node whose sender compares with a prediction", "an event_filter with this trigger", list(filters))
 

@@ -57,7 +57,7 @@ def run(
         reports: for each fusion by `AllReports` and each of its nodes the received values of the report that was sent
             at each step, (steps, received), NaN where it never arrived; `SentReports` where delays differ. For each
             fusion between neighbours and each of its nodes, (steps, rounds times neighbours), NaN where a neighbour's
-            message did not arrive. They may be left out where the links are deterministic.
+            message did not arrive. They may be left out where the links are deterministic (default none).
 
     Returns:
         The record, with the truth that was given: `record.rmse(node, filter)`, `record.nees(node, filter)`.
@@ -96,8 +96,8 @@ def run(
     with jax.enable_x64(True):
         recorded_reports = {} if reports is None else table("reports", reports, "reports by fusion")
         arrivals: dict[str, PyTree] = {
-            name: item.uplinks.recorded(name, item.nodes, recorded_reports.get(name), steps)
-            for name, item in filters.reporting.items()
+            name: centre.uplinks.recorded(name, centre.nodes, recorded_reports.get(name), steps)
+            for name, centre in filters.reporting.items()
         } | {
             name: mesh.edges.recorded(name, mesh.nodes, recorded_reports.get(name), steps)
             for name, mesh in filters.meshes.items()
@@ -130,22 +130,22 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
     # Usually nothing is implausible.
-    result = _filtered(*rest, grouped(), False)
-    if not any_implausible(result):
-        said = doubts(network, result, {})
+    outputs = _filtered(*rest, grouped(), False)
+    if not any_implausible(outputs):
+        said = doubts(network, outputs, {})
     else:
         # Find all rows that are, then filter again without them.
-        result = _filtered(*rest, grouped(), True)
-        refused = refused_rows(network, result)
-        said = doubts(network, result, refused)
+        outputs = _filtered(*rest, grouped(), True)
+        refused = refused_rows(network, outputs)
+        said = doubts(network, outputs, refused)
         for name, rows in refused.items():
             z[name] = z[name].copy()
             z[name][list(rows)] = np.nan
         again = _filtered(*rest, grouped(), False)
-        result = _filtered(*rest, grouped(), True) if any_implausible(again) else again
+        outputs = _filtered(*rest, grouped(), True) if any_implausible(again) else again
     for line in said:
         warnings.warn(line, stacklevel=3)
-    return {name: part for name, part in result.items() if not name.startswith("judged")}
+    return {name: values for name, values in outputs.items() if not name.startswith("judged")}
 
 
 def _filtered(*arguments: PyTree) -> PyTree:

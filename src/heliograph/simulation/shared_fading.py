@@ -34,16 +34,16 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
         ValueError: one name for memories that differ.
     """
     held = {id(channel): memories(channel) for channel in {id(c): c for c in channels.values()}.values()}
-    distinct(memory for item in held.values() for memory in item.values())
+    distinct(memory for by_identity in held.values() for memory in by_identity.values())
     return {
         name: np.array(
             [
                 checksum(f"memory {i} of {name}" if memory.name is None else identity)
-                for i, (identity, memory) in enumerate(item.items())
+                for i, (identity, memory) in enumerate(by_identity.items())
             ],
             dtype=np.uint32,
         )
-        for name, item in ((name, held[id(channel)]) for name, channel in channels.items())
+        for name, by_identity in ((name, held[id(channel)]) for name, channel in channels.items())
     }
 
 
@@ -85,30 +85,30 @@ class Late(NamedTuple):
     line: jax.Array
 
 
-def start(channel: Channel, key: jax.Array, place: Number, shared: Places) -> PyTree:
+def start(channel: Channel, key: jax.Array, source: Number, shared: Places) -> PyTree:
     """Return a channel's state before the first step."""
-    now, local = at(channel, 0), draw_key(key, 0, place, CHANNEL_START)
+    now, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
     keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
-    state = begin(now, local, keys) if len(shared) else now.init(local)
+    state = begin(now, link_key, keys) if len(shared) else now.init(link_key)
     return Late(state, jnp.zeros(now.past * sent(now))) if now.past else state
 
 
 def deliver(
-    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number, shared: Places
+    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: Places
 ) -> tuple[PyTree, jax.Array]:
     """Draw the channel at step k and apply it to y, a late one to past signals too: next state and output."""
-    now, local = at(channel, k), draw_key(key, k, place, CHANNEL)
+    now, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
     if now.past:
         line = jnp.concatenate([y, state.line])
-        after, h = _drawn(now, state.channel, key, k, local, shared)
+        after, h = _drawn(now, state.channel, key, k, link_key, shared)
         return Late(after, line[: -len(y)]), apply(h, line)
-    state, h = _drawn(now, state, key, k, local, shared)
+    state, h = _drawn(now, state, key, k, link_key, shared)
     return state, apply(h, y)
 
 
 def _drawn(
-    now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, local: jax.Array, shared: Places
+    now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: Places
 ) -> tuple[PyTree, jax.Array]:
     if not len(shared):
-        return now.draw(state, local)
-    return advance(now, state, local, [draw_key(key, k, memory, MEMORY) for memory in shared])
+        return now.draw(state, link_key)
+    return advance(now, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])

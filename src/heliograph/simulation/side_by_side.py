@@ -113,8 +113,8 @@ class Alike(Module):
         """Apply `read` to this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        items = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
-        return items(filters, states, z)
+        read_all = eqx.filter_vmap(lambda node, state, z: read(node, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
+        return read_all(filters, states, z)
 
 
 def started(filter: AbstractFilter) -> PyTree:

@@ -146,8 +146,8 @@ def monte_carlo(
     if single:
         network = network.in_single_precision()
         smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
-    result: Record | Any = finished(job.reducer, recorded, network, smoothing)
-    return result
+    outcome: Record | Any = finished(job.reducer, recorded, network, smoothing)
+    return outcome
 
 
 class _Job(Module):
@@ -176,7 +176,7 @@ def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progre
     total = lanes.total()
     sums, common = (
         jax.tree.map(read, total, is_leaf=is_shared)
-        for read in (lambda part: part.value if is_shared(part) else part, is_shared)
+        for read in (lambda leaf: leaf.value if is_shared(leaf) else leaf, is_shared)
     )
     return Recorded(OfStep(*sums), OfStep(*common), batch_counts(first_run, first_run + runs), collected)
 
@@ -206,8 +206,8 @@ def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
 @quickly_compiled
 def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Sum over every lane's blocks, with a leading axis for the lanes."""
-    result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
-    return result
+    sums: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
+    return sums
 
 
 def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
@@ -215,13 +215,13 @@ def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     if job.single:
         with jax.enable_x64(False):
             world, inputs = jax.tree.map(_single, (job.world, job.inputs))
-            result = _trajectories(world, inputs, job.key, runs)
-        result = jax.tree.map(
-            lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, result
+            outputs = _trajectories(world, inputs, job.key, runs)
+        outputs = jax.tree.map(
+            lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs
         )
     else:
-        result = _trajectories(job.world, job.inputs, job.key, runs)
-    recorded = _reduced(job.reducer, job.later, result)
+        outputs = _trajectories(job.world, job.inputs, job.key, runs)
+    recorded = _reduced(job.reducer, job.later, outputs)
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     # What all runs share stands as of one; of the others the axis of runs becomes one of batches, without padding.
@@ -253,8 +253,8 @@ def _simulated(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTr
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
-def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, result: PyTree) -> OfStep:
-    recorded: OfStep = each_run(partial(reduced_run, reducer, later), result)
+def _each_reduced(reducer: AbstractReducer[Any], later: Smoother | None, outputs: PyTree) -> OfStep:
+    recorded: OfStep = each_run(partial(reduced_run, reducer, later), outputs)
     return recorded
 
 

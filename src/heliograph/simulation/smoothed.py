@@ -46,32 +46,32 @@ class Smoother(Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
     groups: tuple[int, ...] = eqx.field(static=True)
 
-    def both(self, result: PyTree) -> PyTree:
+    def both(self, outputs: PyTree) -> PyTree:
         """Results of a run (time, ...) for a reducer, "filtered" and "smoothed", and sums of the NIS."""
-        steps_by_kind = [result["smoother_steps"][k] for k in self.kinds]
-        filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "central_steps")}
+        steps_by_kind = [outputs["smoother_steps"][k] for k in self.kinds]
+        filtered = {name: values for name, values in outputs.items() if name not in ("smoother_steps", "central_steps")}
         # Smoothed estimates of nodes and central filters, then their fusions.
         sweep = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
         estimates = tuple(sweep(steps) for steps in steps_by_kind)
-        fused = {name: self.smoothing.sweep(steps) for name, steps in result["central_steps"].items()}
+        fused = {name: self.smoothing.sweep(steps) for name, steps in outputs["central_steps"].items()}
         for fusion in self.fusions:
             fused |= _combined(fusion, estimates)
         # As of the steps that are smoothed.
         length = len(jax.tree.leaves((estimates, fused))[0])
         smoothed = {
-            "measurements": tuple(result["measurements"][g][-length:] for g in self.groups),
+            "measurements": tuple(outputs["measurements"][g][-length:] for g in self.groups),
             "estimates": estimates,
             "fused": fused,
             "uplinks": {},
             "reports": {},
         }
-        if "truth" in result:
-            truth = self.smoothing.about(result["truth"])
+        if "truth" in outputs:
+            truth = self.smoothing.about(outputs["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_by_kind])}
         # Sums of the NIS, for the test of consistency.
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         nis = tuple(surprised(steps) for steps in steps_by_kind)
-        centrally = {name: nis_sums(steps) for name, steps in result["central_steps"].items()}
+        centrally = {name: nis_sums(steps) for name, steps in outputs["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
     def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
@@ -83,21 +83,21 @@ class Smoother(Module):
             return Estimate(nearest(mean, others, which), estimate.covariance, estimate.claim)
 
         every = next((which for which in angles if which), ())
-        estimates = tuple(near(item, which) for item, which in zip(known["estimates"], angles, strict=True))
-        return {"estimates": estimates, "fused": {name: near(item, every) for name, item in known["fused"].items()}}
+        estimates = tuple(near(e, which) for e, which in zip(known["estimates"], angles, strict=True))
+        return {"estimates": estimates, "fused": {name: near(e, every) for name, e in known["fused"].items()}}
 
 
 def _combined(fusion: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
     """Fuse estimates (time, filter, node, ...) at each time."""
-    result: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
-    return result
+    fused: dict[str, Estimate] = jax.vmap(lambda parts: fusion.step((), parts, jnp.asarray(0))[1])(estimates)
+    return fused
 
 
-def reduced_run(reducer: AbstractReducer[Result], later: Smoother | None, result: PyTree) -> OfStep:
+def reduced_run(reducer: AbstractReducer[Result], later: Smoother | None, outputs: PyTree) -> OfStep:
     """Reduce the results of a run (time, ...); with a smoother pairs of filtered and smoothed ones, and its NIS."""
     if later is None:
-        return of_rows(reducer, result)
-    both = later.both(result)
+        return of_rows(reducer, outputs)
+    both = later.both(outputs)
     filtered, smoothed = of_rows(reducer, both["filtered"]), of_rows(reducer, both["smoothed"])
     return OfStep(
         (filtered.sums, smoothed.sums, both["nis"]),
@@ -132,18 +132,19 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
         between = f"fusions between neighbours {list(network.meshes)}"
         raise fail("smoothing", "filters, and fusions at a centre", between)
     # Relays send filtered estimates: the receiver alone is smoothed.
-    part = network
+    smoothed = network
     if network.relays is not None:
-        part = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
+        smoothed = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
-        name: {f: _smoothed_claim(filter) for f, filter in node.filters.items()} for name, node in part.nodes.items()
+        name: {f: _smoothed_claim(filter) for f, filter in node.filters.items()}
+        for name, node in smoothed.nodes.items()
     }
-    if part.fused:
-        claims[FUSED] = {name: _fused_claim(part, name, fusion, claims) for name, fusion in part.fused.items()}
-    groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(part.names))
+    if smoothed.fused:
+        claims[FUSED] = {name: _fused_claim(smoothed, name, fusion, claims) for name, fusion in smoothed.fused.items()}
+    groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(smoothed.names))
     kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
-    return Part(part, smoothing, kinds, groups, claims)
+    return Part(smoothed, smoothing, kinds, groups, claims)
 
 
 def _smoothed_claim(filter: AbstractFilter) -> Claim:
@@ -176,24 +177,24 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
         warn_of(f"{FUSED}/{name}", np.asarray(sums))
 
 
-def record_of(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
+def record_of(network: Network, smoothing: Part | None, outputs: PyTree, time: np.ndarray) -> Record:
     """Record of a recording, with its smoothed part."""
-    if part is None:
-        return trajectories_record(network, {"truth": None, **result}, time)
-    _warn_of_inconsistency(part.network, result["nis"])
-    filtered = trajectories_record(network, {"truth": None, **result["filtered"]}, time)
-    length = result["smoothed"]["measurements"][0].shape[0]
-    smoothed = trajectories_record(part.network, {"truth": None, **result["smoothed"]}, time[-length:])
-    return Trajectories().others(filtered, smoothed, part.claims)
+    if smoothing is None:
+        return trajectories_record(network, {"truth": None, **outputs}, time)
+    _warn_of_inconsistency(smoothing.network, outputs["nis"])
+    filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
+    length = outputs["smoothed"]["measurements"][0].shape[0]
+    smoothed = trajectories_record(smoothing.network, {"truth": None, **outputs["smoothed"]}, time[-length:])
+    return Trajectories().others(filtered, smoothed, smoothing.claims)
 
 
 def with_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: AbstractSmoothing | None) -> Record:
     """Return the record of a recording with the true states, angles of estimates within half a turn of them."""
 
-    def near(item: Estimate, x: np.ndarray) -> Estimate:
-        mean = np.asarray(item.mean)
+    def near(estimate: Estimate, x: np.ndarray) -> Estimate:
+        mean = np.asarray(estimate.mean)
         known = np.where(np.isnan(x), mean, x)
-        return Estimate(first(plant).near(mean, known), item.covariance, item.claim)
+        return Estimate(first(plant).near(mean, known), estimate.covariance, estimate.claim)
 
     later = record.smoothed
     if later is not None and smoothing is not None:
@@ -216,23 +217,23 @@ class Recorded(NamedTuple):
     collected: PyTree
 
 
-def finished(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, part: Part | None) -> Result:
+def finished(reducer: AbstractReducer[Result], recorded: Recorded, network: Network, smoothing: Part | None) -> Result:
     """Make the result of a network, with that of its smoothed part; warn of filters that are not consistent."""
     sums, common, count, collected = recorded
     # Without smoothing the result of the network alone.
-    if part is None:
+    if smoothing is None:
         return reducer.finish(reducer.summed(sums, common, count), collected, network)
     # Pairs of filtered and smoothed estimates, and sums of the NIS over all runs.
     nis = jax.tree.map(
         lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
     )
-    _warn_of_inconsistency(part.network, nis)
+    _warn_of_inconsistency(smoothing.network, nis)
     filtered, smoothed = (
         reducer.finish(
             reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count),
             collected[i],
             of,
         )
-        for i, of in enumerate((network, part.network))
+        for i, of in enumerate((network, smoothing.network))
     )
-    return reducer.others(filtered, smoothed, part.claims)
+    return reducer.others(filtered, smoothed, smoothing.claims)

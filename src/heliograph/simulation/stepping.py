@@ -97,16 +97,18 @@ class AllFilters(Module):
 
     def init(self) -> PyTree:
         """Return states before the first step: of filters, central ones, quantizers, centres, reports, tests."""
-        central = {name: started(item) for name, item in self.central.items()}
-        local = tuple(item.init() for item in self.alike)
+        central = {name: started(filter) for name, filter in self.central.items()}
+        states = tuple(stacked.init() for stacked in self.alike)
         sent = tuple(fusion.init(self.n) for fusion in self.fusions)
-        reporting: dict[str, PyTree] = {name: item.init() for name, item in self.reporting.items()}
+        reporting: dict[str, PyTree] = {name: link.init() for name, link in self.reporting.items()}
         reporting |= {name: mesh.init() for name, mesh in self.meshes.items()}
         tested = {name: test.start for name, test in self.tests.items()}
-        return local, central, sent, tuple(self._started(centre, local) for centre in self.centres), reporting, tested
+        return states, central, sent, tuple(self._started(centre, states) for centre in self.centres), reporting, tested
 
-    def _started(self, centre: Centre | LinearisedCentre, local: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
-        means = [local[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
+    def _started(
+        self, centre: Centre | LinearisedCentre, states: Sequence[PyTree]
+    ) -> CentreState | dict[str, Followed]:
+        means = [states[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
         return centre.init(means)
 
     @property
@@ -114,14 +116,14 @@ class AllFilters(Module):
         """Centres of filters whose gains do not depend on data."""
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
-    def matrices(self, centre: Centre, local: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
         """Matrices of a centre's sources at step k; they depend on covariances alone, so z may be zero."""
-        return [self.alike[i].matrices(centre.read, local[i], f, self._quiet(i), u, k) for i, f in centre.sources]
+        return [self.alike[i].matrices(centre.read, states[i], f, self._quiet(i), u, k) for i, f in centre.sources]
 
-    def followed(self, local: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+    def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """States of the nodes' filters after step k, for measurements of zero."""
-        pairs = zip(self.alike, local, strict=True)
-        return tuple(item.step(state, self._quiet(i), u, k)[0] for i, (item, state) in enumerate(pairs))
+        pairs = zip(self.alike, states, strict=True)
+        return tuple(stacked.step(state, self._quiet(i), u, k)[0] for i, (stacked, state) in enumerate(pairs))
 
     def _quiet(self, kind: int) -> jax.Array:
         return jnp.zeros((self.alike[kind].nodes, self.alike[kind].filters.received))
@@ -148,23 +150,23 @@ class AllFilters(Module):
         # The nodes' filters.
         reasons = [None] * len(filter_states) if skip is None else skip[0]
         stepped = [
-            item.step(state, z[item.group], u, k, why)
-            for item, state, why in zip(self.alike, filter_states, reasons, strict=True)
+            stacked.step(state, z[stacked.group], u, k, why)
+            for stacked, state, why in zip(self.alike, filter_states, reasons, strict=True)
         ]
         estimates = tuple(single.estimate for _, single in stepped)
         # Central filters, on all measurements in the order of the nodes.
-        joined = jnp.concatenate([jnp.ravel(part) for part in z])
+        joined = jnp.concatenate([jnp.ravel(values) for values in z])
         joined = joined if self.order is None else joined[self.order]
         received = {
-            name: filter_step(item, central[name], joined, u, k, self.smooths, self.judges, skip and skip[1][name])
-            for name, item in self.central.items()
+            name: filter_step(filter, central[name], joined, u, k, self.smooths, self.judges, skip and skip[1][name])
+            for name, filter in self.central.items()
         }
         fused = {name: single.estimate for name, (_, single) in received.items()}
         uplinks: dict[str, PyTree] = {}
         after = []
         # Fusions of the estimates, through their quantizers.
-        for item, state in zip(self.fusions, quantizer_states, strict=True):
-            following, outcome, traffic = item.step(state, estimates, k)
+        for fusion, state in zip(self.fusions, quantizer_states, strict=True):
+            following, outcome, traffic = fusion.step(state, estimates, k)
             after.append(following)
             fused |= outcome
             uplinks |= traffic
@@ -213,7 +215,7 @@ class AllFilters(Module):
         self,
         centre: Centre | LinearisedCentre,
         state: PyTree,
-        local: PyTree,
+        states: PyTree,
         z: Sequence[jax.Array],
         estimates: Sequence[Estimate],
         u: jax.Array,
@@ -221,7 +223,7 @@ class AllFilters(Module):
     ) -> tuple[PyTree, dict[str, Estimate]]:
         """Step a centre, which reads the matrices of its sources' steps before they are taken."""
         parts = [
-            self.alike[i].matrices(centre.read, local[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
+            self.alike[i].matrices(centre.read, states[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
         ]
         means = [jnp.asarray(estimates[i].mean)[f] for i, f in centre.sources]
         return centre.step(state, parts, means, u, k)
@@ -235,14 +237,14 @@ def begun(filters: AllFilters) -> PyTree:
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Precompute what does not depend on data, where all data arrive."""
-    ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
+    ahead = {i: stacked for i, stacked in enumerate(filters.alike) if filters.complete[stacked.group]}
     central = filters.central if all(filters.complete) else {}
     with jax.enable_x64(True):
         planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.smooths, np.asarray(u)))
     done = dict(zip(ahead, planned, strict=True))
-    alike = tuple(done.get(i, item) for i, item in enumerate(filters.alike))
-    result = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
-    return cast(AllFilters, to_numpy(result))
+    alike = tuple(done.get(i, stacked) for i, stacked in enumerate(filters.alike))
+    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
+    return cast(AllFilters, to_numpy(changed))
 
 
 @quickly_compiled
@@ -255,17 +257,16 @@ def _plan(
         return planned_with_past(filter, u) if smooths else filter.planned(u)
 
     planned = tuple(
-        replace(item, filters=over_all(partial(single, smooths=item.smooths), item.count * item.nodes)(item.filters))
-        for item in alike
+        replace(a, filters=over_all(partial(single, smooths=a.smooths), a.count * a.nodes)(a.filters)) for a in alike
     )
-    return planned, {name: single(item, smooths) for name, item in central.items()}
+    return planned, {name: single(filter, smooths) for name, filter in central.items()}
 
 
 def plans(filters: AllFilters) -> bool:
     """Test whether some filter has anything to precompute."""
     return any(
-        type(item).planned is not AbstractFilter.planned
-        for item in (*(part.filters for part in filters.alike), *filters.central.values())
+        type(filter).planned is not AbstractFilter.planned
+        for filter in (*(stacked.filters for stacked in filters.alike), *filters.central.values())
     )
 
 
@@ -288,6 +289,10 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
     that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
     the bound on its error. Claim: as the fusion's.
+
+    Args:
+        network: the network.
+        name: of its fusion.
 
     Raises:
         ValueError: no fusion of this name, or one by another rule.

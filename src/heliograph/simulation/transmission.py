@@ -54,5 +54,5 @@ def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> j
         return state, jnp.where(unsent, jnp.nan, apply(h, jnp.where(missing, 0.0, y_k)))
 
     start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
-    result: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))[1]
-    return result
+    received: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))[1]
+    return received

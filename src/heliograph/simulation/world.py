@@ -34,24 +34,24 @@ class World(Module):
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         medium, z = self.medium.receive(medium, x, u, key, k)
-        z = tuple(arrived(item) if whole else item for item, whole in zip(z, self.filters.complete, strict=True))
-        drawn: dict[str, PyTree] = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        z = tuple(arrived(values) if whole else values for values, whole in zip(z, self.filters.complete, strict=True))
+        drawn: dict[str, PyTree] = {name: link.uplinks.draw(key, k) for name, link in self.filters.reporting.items()}
         across = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
         edges = {name: state for name, (state, _) in across.items()}
         drawn |= {name: arrived for name, (_, arrived) in across.items()}
-        states, result = self.filters.step(states, z, u, k, drawn)
-        after = x, self.medium.feed_back(medium, result["estimates"]), states, edges
-        seen = {"truth": x, "measurements": z, "transmissions": self.medium.reasons(medium), **_near(plant, x, result)}
+        states, outputs = self.filters.step(states, z, u, k, drawn)
+        after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges
+        seen = {"truth": x, "measurements": z, "transmissions": self.medium.reasons(medium), **_near(plant, x, outputs)}
         return after, seen
 
 
-def _near(plant: AbstractPlant, x: jax.Array, result: dict[str, PyTree]) -> dict[str, PyTree]:
+def _near(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
     """Estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
-        return result
+        return outputs
 
     def near(estimate: Estimate) -> Estimate:
         return Estimate(plant.near(jnp.asarray(estimate.mean), x), estimate.covariance, estimate.claim)
 
-    items = {key: result[key] for key in ("estimates", "fused")}
-    return {**result, **jax.tree.map(near, items, is_leaf=lambda leaf: isinstance(leaf, Estimate))}
+    items = {key: outputs[key] for key in ("estimates", "fused")}
+    return {**outputs, **jax.tree.map(near, items, is_leaf=lambda leaf: isinstance(leaf, Estimate))}

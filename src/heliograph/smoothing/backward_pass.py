@@ -96,12 +96,12 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
     """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
 
     def estimate_from(step: AbstractSmootherStep, moments: Moments) -> tuple[jax.Array, jax.Array]:
-        result = step.estimate_from(moments)
-        return jnp.asarray(result.mean), jnp.asarray(result.covariance)
+        estimate = step.estimate_from(moments)
+        return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
     # One step back: the adjoint or the moments, and the smoothed state before the step.
-    def body(carry: PyTree, item: tuple[AbstractSmootherStep, AbstractSmootherStep]) -> tuple[PyTree, PyTree]:
-        (later, known), (before, step) = carry, item
+    def body(carry: PyTree, pair: tuple[AbstractSmootherStep, AbstractSmootherStep]) -> tuple[PyTree, PyTree]:
+        (later, known), (before, step) = carry, pair
         earlier = step.back(later, before.mean, before.covariance)
         moments = step.before(before, earlier, known)
         return (earlier, moments), estimate_from(before, moments)
@@ -115,9 +115,9 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
     rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
     shapes, _ = jax.eval_shape(body, start, row(rows, -1))  # of what runs share, their axis is 1 long
     end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
-    _, result = jax.lax.scan(body, end, rows, reverse=True)
+    _, smoothed = jax.lax.scan(body, end, rows, reverse=True)
     mean, covariance = (
-        jnp.concatenate([part, item[None]]) for part, item in zip(result, estimate_from(last, end[1]), strict=True)
+        jnp.concatenate([a, b[None]]) for a, b in zip(smoothed, estimate_from(last, end[1]), strict=True)
     )
     return mean, covariance
 
@@ -125,18 +125,18 @@ def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
 def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
-    items = jnp.arange(last + 1)
+    times = jnp.arange(last + 1)
     # Begin at the newest step that each one may use.
-    ends = rows_of(steps, jnp.minimum(items + lag, last))
+    ends = rows_of(steps, jnp.minimum(times + lag, last))
     newest = jax.vmap(lambda step: step.end())(ends)
     start = newest, jax.vmap(lambda step, later: step.smoothed(later))(ends, newest)
 
     def body(done: jax.Array, carry: tuple[PyTree, Moments]) -> tuple[PyTree, Moments]:
         """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
         later, known = carry
-        ahead = items + lag - done
-        place = jnp.minimum(ahead, last)
-        here, before = rows_of(steps, place), rows_of(steps, jnp.maximum(place - 1, 0))
+        ahead = times + lag - done
+        index = jnp.minimum(ahead, last)
+        here, before = rows_of(steps, index), rows_of(steps, jnp.maximum(index - 1, 0))
         earlier = jax.vmap(lambda step, *rest: step.back(*rest))(here, later, before.mean, before.covariance)
         moments = jax.vmap(lambda step, *rest: step.before(*rest))(here, before, earlier, known)
         both: tuple[PyTree, Moments] = jax.tree.map(
@@ -146,37 +146,37 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
 
     # As many steps back as the lag has.
     _, outcome = jax.lax.fori_loop(0, lag, body, start)
-    result: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
-    return result
+    estimate: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
+    return estimate
 
 
 def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, item: tuple[AbstractSmootherStep, jax.Array]) -> tuple[Point, Moments]:
-        here, before = item
+    def body(point: Point, step_and_prior: tuple[AbstractSmootherStep, jax.Array]) -> tuple[Point, Moments]:
+        here, before = step_and_prior
         after = here.ahead(point, before)
         return after, Moments(after.mean, after.covariance)
 
     rows = rows_of(steps, slice(step + 1, None)), steps.covariance[step:-1]
     _, outcome = jax.lax.scan(body, start.start(), rows)
     first = Moments(start.mean, start.covariance)
-    whole = jax.tree.map(lambda item, rest: jnp.concatenate([item[None], rest]), first, outcome)
-    result: Estimate = jax.vmap(start.estimate_from)(whole)
-    return result
+    whole = jax.tree.map(lambda leaf, rest: jnp.concatenate([leaf[None], rest]), first, outcome)
+    estimate: Estimate = jax.vmap(start.estimate_from)(whole)
+    return estimate
 
 
 def row(steps: T, k: int) -> T:
     """Return one step of what is stacked along time."""
-    result: T = jax.tree.map(lambda leaf: leaf[k], steps)
-    return result
+    step: T = jax.tree.map(lambda leaf: leaf[k], steps)
+    return step
 
 
 def rows_of(steps: T, which: slice | jax.Array) -> T:
     """Return some steps of what is stacked along time."""
-    result: T = jax.tree.map(lambda leaf: leaf[which], steps)
-    return result
+    chosen: T = jax.tree.map(lambda leaf: leaf[which], steps)
+    return chosen
 
 
 def _column(marks: jax.Array, like: jax.Array) -> jax.Array:

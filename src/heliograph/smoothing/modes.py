@@ -30,13 +30,13 @@ def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
     time = len(steps.mean)
     count = min(BLOCKS, time)
     edges = [-(-time * i // count) for i in range(count + 1)]
-    s, h = (jnp.stack([jnp.sum(part[a:b]) for a, b in pairwise(edges)]) for part in (steps.nis, steps.received))
-    return jnp.stack([jnp.sum(part) for part in (s, h, s * s, s * h, h * h)])
+    s, h = (jnp.stack([jnp.sum(values[a:b]) for a, b in pairwise(edges)]) for values in (steps.nis, steps.received))
+    return jnp.stack([jnp.sum(values) for values in (s, h, s * s, s * h, h * h)])
 
 
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
     """Mean NIS per component, 1 for a consistent filter, and its standard error from the scatter of the blocks."""
-    s, h, ss, sh, hh = (float(part) for part in sums)
+    s, h, ss, sh, hh = (float(total) for total in sums)
     if not h:
         return 1.0, 0.0
     ratio = s / h
@@ -143,8 +143,8 @@ class FixedPoint(AbstractSmoothing):
 
     def about(self, values: A) -> A:
         """Repeat the value of that step, once per estimate of it."""
-        result: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
-        return result
+        repeated: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
+        return repeated
 
     def check(self, horizon: int) -> None:
         """Raise ValueError if the step is not one of the run's."""

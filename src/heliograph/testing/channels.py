@@ -72,9 +72,9 @@ def _compare_modes(
     given = {
         order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
     }  # E[mono(z) | mode], (mode, monomials)
-    for order, (item, two) in given.items():
-        worst = max(worst, _compare(f"order {order}, first draw", begin @ item, _monomials(now, order)))
-        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ two, _monomials(later, order)))
+    for order, (at_first, at_second) in given.items():
+        worst = max(worst, _compare(f"order {order}, first draw", begin @ at_first, _monomials(now, order)))
+        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ at_second, _monomials(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", begin, rows, given[i][0], given[j][1]).reshape(-1)
         seen = np.einsum("sm,sl->sml", _monomials(now, i), _monomials(later, j)).reshape(len(now), -1)

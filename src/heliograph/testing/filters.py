@@ -18,7 +18,7 @@ from heliograph.simulation.likelihood import log_likelihood
 ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
 
 
-def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
+def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
     """Check the contract of a filter on random measurements, with the same inputs at each step.
 
     Claim and sizes are stated, and a measurement or input of another size is refused. A step equals prediction and
@@ -28,7 +28,7 @@ def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, s
     claimed, 0 if nothing arrived, and `log_likelihood` of a run is the sum.
 
     Args:
-        item: the filter to test.
+        filter: the filter to test.
         inputs: the plant's inputs, shape (inputs,); by default none.
         steps: number of steps (default 5).
         seed: seed of the measurements (default 0).
@@ -36,33 +36,33 @@ def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, s
     Raises:
         AssertionError: naming the rule that is broken.
     """
-    _check_sizes(item, inputs)
+    _check_sizes(filter, inputs)
     # Measurements: the first complete, then some components missing, the last with all missing.
-    data = np.random.default_rng(seed).normal(size=(steps, item.received))
+    data = np.random.default_rng(seed).normal(size=(steps, filter.received))
     data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < 0.3] = np.nan
     data[-1] = np.nan
-    u = np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(item.inputs)))
-    state, total = item.init(), 0.0
+    u = np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(filter.inputs)))
+    state, total = filter.init(), 0.0
     structure = str(jax.tree.structure(state))
     for k, z in enumerate(data):
         # Each step twice: determinism, structure, estimate, prediction + correction, vmap.
-        arguments = item, state, z, u[k], np.asarray(k)
+        arguments = filter, state, z, u[k], np.asarray(k)
         seen, again = (computed(_seen, _seen_by_xla, arguments) for _ in range(2))
         (following, estimate), (corrected, innovation) = seen.step, seen.correction
         assert np.array_equal(estimate.mean, again.step[1].mean), (
             "step: expected the same estimate from the same arguments"
         )
-        for part in (following, corrected):
-            assert str(jax.tree.structure(part)) == structure, "step: expected a state of init's structure"
-        _check_estimate(estimate, len(item.states), k)
-        _same(f"step {k}: the prediction, corrected", item.estimate(corrected), estimate)
-        _check_innovation(innovation, z, item, k)
+        for belief in (following, corrected):
+            assert str(jax.tree.structure(belief)) == structure, "step: expected a state of init's structure"
+        _check_estimate(estimate, len(filter.states), k)
+        _same(f"step {k}: the prediction, corrected", filter.estimate(corrected), estimate)
+        _check_innovation(innovation, z, filter, k)
         gap = np.abs(seen.side_by_side - estimate.mean).max()
         scale = 1 + np.abs(estimate.mean).max()
         assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
         state, total = following, total + float(innovation.log_likelihood)
     # log p(z_1, ..., z_N) = sum of the innovations' log-likelihoods.
-    whole = float(log_likelihood(item, data, u))
+    whole = float(log_likelihood(filter, data, u))
     same = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
     assert same, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
 
@@ -75,30 +75,30 @@ class Seen(NamedTuple):
     side_by_side: PyTree
 
 
-def _seen(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> Seen:
+def _seen(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> Seen:
     twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z))
-    means = jax.vmap(lambda s, z: item.step(s, z, u, k)[1].mean)(*twice)
-    return Seen(item.step(state, z, u, k), item.correct(item.predict(state, u, k), z, k), means)
+    means = jax.vmap(lambda s, z: filter.step(s, z, u, k)[1].mean)(*twice)
+    return Seen(filter.step(state, z, u, k), filter.correct(filter.predict(state, u, k), z, k), means)
 
 
 _seen_by_xla = compiled(_seen)
 
 
-def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
-    assert item.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {item.claim!r}"
-    assert item.states and len(set(item.states)) == len(item.states), "states: expected distinct names"
-    assert item.received >= 0, "received: expected a length"
+def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
+    assert filter.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {filter.claim!r}"
+    assert filter.states and len(set(filter.states)) == len(filter.states), "states: expected distinct names"
+    assert filter.received >= 0, "received: expected a length"
     # Calls with wrong sizes or infinite values, each with the name that the error must begin with.
-    state, fitting = item.init(), np.zeros(item.received)
+    state, fitting = filter.init(), np.zeros(filter.received)
     wrong: list[tuple[str, Callable[[], object]]] = [
-        ("inputs", lambda: item.predict(state, np.zeros(len(item.inputs) + 1)))
+        ("inputs", lambda: filter.predict(state, np.zeros(len(filter.inputs) + 1)))
     ]
-    if item.received:
-        longer = np.zeros(item.received + 1)
-        wrong.append(("measurement", lambda: item.correct(state, longer)))
-        wrong.append(("measurement", lambda: item.step(state, np.full(item.received, np.inf), inputs)))
-        wrong.append(("measurement", lambda: item.step(state, longer, inputs)))
-    wrong.append(("step", lambda: item.step(state, fitting, inputs, -1)))
+    if filter.received:
+        longer = np.zeros(filter.received + 1)
+        wrong.append(("measurement", lambda: filter.correct(state, longer)))
+        wrong.append(("measurement", lambda: filter.step(state, np.full(filter.received, np.inf), inputs)))
+        wrong.append(("measurement", lambda: filter.step(state, longer, inputs)))
+    wrong.append(("step", lambda: filter.step(state, fitting, inputs, -1)))
     for name, call in wrong:
         try:
             call()
@@ -126,16 +126,16 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
     )
 
 
-def _check_innovation(innovation: Innovation, z: np.ndarray, item: AbstractFilter, k: int) -> None:
+def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFilter, k: int) -> None:
     m, missing, likelihood = len(z), np.isnan(z), float(innovation.log_likelihood)
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
     assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
-    if np.all(missing) and item.silence_tells:
+    if np.all(missing) and filter.silence_tells:
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood of silence, got {likelihood:g}"
     elif np.all(missing):
         assert likelihood == 0, f"step {k}: expected a log-likelihood of 0 where nothing arrived, got {likelihood:g}"
-    elif item.claim != "none":
+    elif filter.claim != "none":
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood, got {likelihood:g}"
         unknown = missing[:, None] | missing
         assert np.array_equal(np.isnan(covariance), unknown), f"step {k}: expected a covariance where z arrived"

@@ -57,8 +57,8 @@ def _fused(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estim
     return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
 
 
-def _close(what: str, result: Array, expected: Array) -> None:
-    gap = np.abs(np.asarray(result) - expected).max()
+def _close(what: str, got: Array, expected: Array) -> None:
+    gap = np.abs(np.asarray(got) - expected).max()
     assert gap <= SEARCHED * np.abs(expected).max(), f"{what}: expected the same back, off by {gap:g}"
 
 
@@ -97,15 +97,15 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
         with jax.enable_x64(True):
             batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
             _, twice = compiled(*batch)
-        for name, item in sent._asdict().items():
+        for name, delivered in sent._asdict().items():
             both = np.asarray(getattr(twice, name))
-            same = np.allclose(both, item, rtol=ROUNDING, atol=0, equal_nan=True)
+            same = np.allclose(both, delivered, rtol=ROUNDING, atol=0, equal_nan=True)
             assert same, f"step {k}, {name}: expected the same under jit and vmap"
         state = following
 
 
 def _check_quantized(sent: Quantized, value: np.ndarray, n: int) -> None:
-    assert all(np.shape(part) == (n,) for part in sent), f"step: expected parts of shape ({n},)"
+    assert all(np.shape(field) == (n,) for field in sent), f"step: expected parts of shape ({n},)"
     unusable = np.asarray(sent.saturated) | np.isnan(value)
     assert np.array_equal(np.isnan(sent.error), unusable), "error: expected NaN where saturated or NaN, and only there"
     assert np.array_equal(np.isnan(sent.value), np.isnan(value)), "value: expected NaN for NaN, and only there"

@@ -57,71 +57,73 @@ class Units(NamedTuple):
     inputs: Float[np.ndarray, " u"]
 
 
-def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
-    """Return the filter with estimate S xhat from Q z and U u, where `item` has xhat from z and u.
+def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
+    """Return the filter with estimate S xhat from Q z and U u, where `filter` has xhat from z and u.
 
     Raises:
         ValueError: a filter of an unknown kind.
     """
     s = units.states
     # x -> S x: mean S m, covariance S P S; plant, sensor and channel in the new units.
-    match item:
+    match filter:
         case GaussianFilter():
             return replace(
-                item,
-                plant=rescaled_plant(item.plant, units),
-                sensor=rescaled_sensor(item.sensor, units),
-                channel=_channel(item.channel, units),
-                initial_mean=s * item.initial_mean,
-                initial_covariance=np.outer(s, s) * item.initial_covariance,
+                filter,
+                plant=rescaled_plant(filter.plant, units),
+                sensor=rescaled_sensor(filter.sensor, units),
+                channel=_channel(filter.channel, units),
+                initial_mean=s * filter.initial_mean,
+                initial_covariance=np.outer(s, s) * filter.initial_covariance,
             )
         case LinearFilter():
-            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
-            return replace(item, plant=plant, sensor=sensor, channel=_channel(item.channel, units))
+            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            return replace(filter, plant=plant, sensor=sensor, channel=_channel(filter.channel, units))
         case OpenLoop():
             return replace(
-                item,
-                plant=rescaled_plant(item.plant, units),
-                initial_mean=s * item.initial_mean,
-                initial_covariance=np.outer(s, s) * item.initial_covariance,
+                filter,
+                plant=rescaled_plant(filter.plant, units),
+                initial_mean=s * filter.initial_mean,
+                initial_covariance=np.outer(s, s) * filter.initial_covariance,
             )
         case MixtureFilter():
             return replace(
-                item, plant=rescaled_plant(item.plant, units), components=_components(item.components, units)
+                filter, plant=rescaled_plant(filter.plant, units), components=_components(filter.components, units)
             )
         case PolynomialFilter(inner=LinearSystemFilter()):
-            assert isinstance(item.inner, LinearSystemFilter)
+            assert isinstance(filter.inner, LinearSystemFilter)
             # A filter of products x x' ...: its monomials are scaled by products of the factors.
-            inner = _system(item.inner, item.degree, units)
-            return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
+            inner = _system(filter.inner, filter.degree, units)
+            return PolynomialFilter(inner, filter.degree, filter.endless, _centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
-            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
-            return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
+            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            return replace(filter, plant=plant, sensor=sensor, channel=_by_mode(filter.channel, units))
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
-            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
-            return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
+            plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
+            return replace(filter, plant=plant, sensor=sensor, channel=_by_mode(filter.channel, units))
         case PredictionFilter():
-            return PredictionFilter(_gaussian(rescaled(item.base, units)))
+            return PredictionFilter(_gaussian(rescaled(filter.base, units)))
         case SequentialFilter():
-            return replace(item, filters=tuple(_gaussian(f) for f in _in_turn(item, units)))
+            return replace(filter, filters=tuple(_gaussian(f) for f in _in_turn(filter, units)))
         case _:
-            raise fail("filter to rescale", "one of the package's that computes covariances", type(item).__name__)
+            raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
 
 
-def _gaussian(item: AbstractFilter) -> GaussianFilter:
-    assert isinstance(item, GaussianFilter)
-    return item
+def _gaussian(filter: AbstractFilter) -> GaussianFilter:
+    assert isinstance(filter, GaussianFilter)
+    return filter
 
 
-def _in_turn(item: SequentialFilter, units: Units) -> list[AbstractFilter]:
+def _in_turn(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
     """Split into parts, each with its own outputs and measurements, which follow one another in `units`."""
-    result, received, said = [], 0, 0
-    for part in item.filters:
-        m, p = part.received, len(first(part.sensor).outputs)
-        local = units._replace(outputs=units.outputs[said : said + p], received=units.received[received : received + m])
-        result.append(rescaled(part, local))
+    parts, received, said = [], 0, 0
+    for single in filter.filters:
+        m, p = single.received, len(first(single.sensor).outputs)
+        node_units = units._replace(
+            outputs=units.outputs[said : said + p], received=units.received[received : received + m]
+        )
+        parts.append(rescaled(single, node_units))
         received, said = received + m, said + p
-    return result
+    return parts
 
 
 def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
@@ -130,51 +132,51 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
     return Shaped(np.diag(factors), law)
 
 
-def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
+def rescaled_plant(plant: AnyPlant, units: Units) -> AnyPlant:
     """Return the plant of S x, with inputs U u."""
-    if isinstance(item, OverTime):
-        return over_time([rescaled_plant(single, units) for single in unstack(item)])
+    if isinstance(plant, OverTime):
+        return over_time([rescaled_plant(single, units) for single in unstack(plant)])
     s, u = units.states, units.inputs
-    law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
-    center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
-    given = item.noise
+    law = _noise(plant.deviation, s) if plant.deviation is not None else np.outer(s, s) * plant.initial_covariance
+    center = s * (plant.initial_mean - (plant.deviation.mean if plant.deviation is not None else 0.0))
+    given = plant.noise
     noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
-    names = {"states": item.states, "inputs": item.inputs, "circular": item.circular}
-    if isinstance(item, LinearPlant):
+    names = {"states": plant.states, "inputs": plant.inputs, "circular": plant.circular}
+    if isinstance(plant, LinearPlant):
         matrix, entry = (
             InUnits(given.function, s[:, None] / by, (u,)) if isinstance(given, OfInputs) else s[:, None] * given / by
-            for given, by in ((item.matrix, s), (item.input_matrix, u))
+            for given, by in ((plant.matrix, s), (plant.input_matrix, u))
         )
         return LinearPlant(matrix, noise, center, law, entry, **names)
-    return Plant(InUnits(item.transition, s, (s, u)), noise, center, law, **names)
+    return Plant(InUnits(plant.transition, s, (s, u)), noise, center, law, **names)
 
 
-def rescaled_sensor(item: AnySensor, units: Units) -> AnySensor:
+def rescaled_sensor(sensor: AnySensor, units: Units) -> AnySensor:
     """Return the sensor that measures R y of S x."""
-    if isinstance(item, OverTime):
-        return over_time([rescaled_sensor(single, units) for single in unstack(item)])
+    if isinstance(sensor, OverTime):
+        return over_time([rescaled_sensor(single, units) for single in unstack(sensor)])
     s, r = units.states, units.outputs
-    if isinstance(item, LinearSensor):
-        return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs, item.circular)
-    return Sensor(InUnits(item.measure, r, (s,)), _noise(item.noise, r), item.outputs, item.circular)
+    if isinstance(sensor, LinearSensor):
+        return LinearSensor(r[:, None] * sensor.matrix / s, _noise(sensor.noise, r), sensor.outputs, sensor.circular)
+    return Sensor(InUnits(sensor.measure, r, (s,)), _noise(sensor.noise, r), sensor.outputs, sensor.circular)
 
 
-def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
-    if isinstance(item, OverTime):
-        return over_time([rescaled_channel(single, units) for single in unstack(item)])
-    return rescaled_channel(item, units)
+def _channel(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
+    if isinstance(channel, OverTime):
+        return over_time([rescaled_channel(single, units) for single in unstack(channel)])
+    return rescaled_channel(channel, units)
 
 
-def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
+def rescaled_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the description of z = Q G R^-1 y + Q n."""
     q, (_, factor) = units.received, _of_channel(units)
 
-    def scaled(part: QuadraticMap) -> QuadraticMap:
-        return QuadraticMap(factor * part.center, factor * part.radius)
+    def scaled(quadratic: QuadraticMap) -> QuadraticMap:
+        return QuadraticMap(factor * quadratic.center, factor * quadratic.radius)
 
-    gain, offset = q[:, None] * item.mean_gain / units.outputs, q * item.offset
-    spread, shift, power, nominal = map(scaled, (item.spread, item.shift, item.power, item.nominal))
-    return SecondOrder(gain, offset, spread, shift, power, nominal, item.uncertain)
+    gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+    spread, shift, power, nominal = map(scaled, (channel.spread, channel.shift, channel.power, channel.nominal))
+    return SecondOrder(gain, offset, spread, shift, power, nominal, channel.uncertain)
 
 
 def _of_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
@@ -183,16 +185,16 @@ def _of_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarr
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
 
 
-def _by_mode(item: Modes | OverTime, units: Units) -> Modes | OverTime:
+def _by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of z = Q G R^-1 y + Q n for each mode."""
-    values: Modes = item.values if isinstance(item, OverTime) else item
+    values: Modes = channel.values if isinstance(channel, OverTime) else channel
     of_mean, of_spread = _of_channel(units)
     scaled: Modes = replace(values, mean=of_mean * values.mean, spread=of_spread * values.spread)
-    return OverTime(scaled) if isinstance(item, OverTime) else scaled
+    return OverTime(scaled) if isinstance(channel, OverTime) else scaled
 
 
-def _components(item: Components | OverTime, units: Units) -> Components | OverTime:
-    values = item.values if isinstance(item, OverTime) else item
+def _components(components: Components | OverTime, units: Units) -> Components | OverTime:
+    values = components.values if isinstance(components, OverTime) else components
     q = units.received
     scaled = Components(
         values.weight,
@@ -202,23 +204,23 @@ def _components(item: Components | OverTime, units: Units) -> Components | OverT
         values.mode,
         values.transition,
     )
-    return OverTime(scaled) if isinstance(item, OverTime) else scaled
+    return OverTime(scaled) if isinstance(components, OverTime) else scaled
 
 
-def _centre(item: Centre | None, units: Units) -> Centre | None:
-    if item is None:
+def _centre(centre: Centre | None, units: Units) -> Centre | None:
+    if centre is None:
         return None
     s = units.states
 
-    def scaled(part: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
-        return OverTime(factors * part.values) if isinstance(part, OverTime) else factors * part
+    def scaled(matrix: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+        return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
 
-    received = scaled(item.received, units.received[:, None] / s)
-    return Centre(s * item.start, scaled(item.transition, s[:, None] / s), scaled(item.drift, s), received)
+    received = scaled(centre.received, units.received[:, None] / s)
+    return Centre(s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received)
 
 
-def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
-    y, z, s = _powers(units.states, degree), _powers(units.received, degree), item.steps.values
+def _system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
+    y, z, s = _powers(units.states, degree), _powers(units.received, degree), filter.steps.values
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
         y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))
     steps = Steps(
@@ -229,9 +231,9 @@ def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystem
         z * s.offset,
         np.outer(z, z) * s.noise,
     )
-    projection = units.states[:, None] * item.projection / y
-    system = LinearSystem(steps, y * item.mean, np.outer(y, y) * item.covariance, projection)
-    return LinearSystemFilter(system, item.claim, item.states)
+    projection = units.states[:, None] * filter.projection / y
+    system = LinearSystem(steps, y * filter.mean, np.outer(y, y) * filter.covariance, projection)
+    return LinearSystemFilter(system, filter.claim, filter.states)
 
 
 def _powers(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:

@@ -93,12 +93,12 @@ def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[
 
     n = len(network.states)
     states = np.repeat(factors(1), n) if common else factors(n)
-    inputs, result = factors(len(network.inputs)), {}
+    inputs, units = factors(len(network.inputs)), {}
     for name in network.names:
         node = network.nodes[name]
-        result[name] = Units(states, factors(len(node.outputs)), factors(node.received), inputs)
-    outputs, received = (np.concatenate([result[name][i] for name in network.names]) for i in (1, 2))
-    return result | {FUSED: Units(states, outputs, received, inputs)}
+        units[name] = Units(states, factors(len(node.outputs)), factors(node.received), inputs)
+    outputs, received = (np.concatenate([units[name][i] for name in network.names]) for i in (1, 2))
+    return units | {FUSED: Units(states, outputs, received, inputs)}
 
 
 def _compared(
@@ -110,16 +110,16 @@ def _compared(
     common: bool,
 ) -> float:
     nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
-    fused = {name: _fused(name, item, units[FUSED]) for name, item in network.fused.items()}
+    fused = {name: _fused(name, fusion, units[FUSED]) for name, fusion in network.fused.items()}
     scaled = Network(rescaled_plant(network.plant, units[FUSED]), nodes, fused)
     shared = units[FUSED].inputs
-    result = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
+    estimates = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
     worst = 0.0
     for node, filters in plain.items():
         for name, estimate in filters.items():
             searches = _searches(network, node, name)
             if common or not searches:
-                difference = _difference(estimate, result[node][name], units[node].states) / DIGITS
+                difference = _difference(estimate, estimates[node][name], units[node].states) / DIGITS
                 worst = max(worst, _judged(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0)))
     return worst
 
@@ -140,27 +140,27 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
     deviation = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)).max(axis=0)) if claimed else 0.0
     size = deviation + np.abs(mean).max(axis=0)
     size = np.where(size > 0, size, 1.0)
-    result = np.nan_to_num(np.abs(mean - other) / size, nan=np.inf).max(axis=1)
+    difference = np.nan_to_num(np.abs(mean - other) / size, nan=np.inf).max(axis=1)
     if claimed:
         apart = np.abs(covariance - their) / np.outer(size, size)
-        result = np.maximum(result, np.nan_to_num(apart, nan=np.inf).max(axis=(1, 2)))
-    return np.asarray(result)
+        difference = np.maximum(difference, np.nan_to_num(apart, nan=np.inf).max(axis=(1, 2)))
+    return np.asarray(difference)
 
 
 def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
-    for part in [] if channel.remembers else [outcome.map for outcome in outcomes(channel)]:
-        turned = Series([known(np.diag(1 / units.outputs)), part, known(np.diag(units.received))])
-        off = _apart(rescaled_channel(second_order(part), units), second_order(turned))
+    for affine in [] if channel.remembers else [outcome.map for outcome in outcomes(channel)]:
+        turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
+        off = _apart(rescaled_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
-    filters = {f: rescaled(item, units) for f, item in node.filters.items()}
+    filters = {f: rescaled(filter, units) for f, filter in node.filters.items()}
     return Node(rescaled_sensor(node.sensor, units), _between(node.channel, units), filters)
 
 
 def _between(channel: Channel, units: Units) -> Channel:
     """Return the channel that maps R y to Q z, where this one maps y to z."""
     if isinstance(channel, OverTime):
-        return over_time([_between(item, units) for item in unstack(channel)])
+        return over_time([_between(step, units) for step in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 
@@ -173,39 +173,39 @@ def _apart(a: SecondOrder, b: SecondOrder) -> float:
     reach = np.sqrt(power + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
     size = np.einsum("ia,jb->ijab", reach, reach)
     size = size + size.swapaxes(2, 3)
-    return max(float(np.max(np.abs(item(a) - item(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for item in items)
+    return max(float(np.max(np.abs(read(a) - read(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for read in items)
 
 
-def _ends(part: QuadraticMap) -> np.ndarray:
-    return np.asarray(part.center + part.radius)
+def _ends(quadratic: QuadraticMap) -> np.ndarray:
+    return np.asarray(quadratic.center + quadratic.radius)
 
 
-def _fused(name: str, item: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
-    if isinstance(item, AbstractFilter):
-        return rescaled(item, units)
-    if item.quantizer is not None:
+def _fused(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
+    if isinstance(fusion, AbstractFilter):
+        return rescaled(fusion, units)
+    if fusion.quantizer is not None:
         raise fail(f"fusion {name!r} to rescale", "one without quantizers, whose cells are in units", "quantizers")
-    return item
+    return fusion
 
 
 def _searches(network: Network, node: str, name: str) -> bool:
     """Return whether a trace is minimised on the way to this estimate."""
     if node != FUSED:
         return _minimises(network.nodes[node].filters[name])
-    item = network.fused[name]
-    if isinstance(item, AbstractFilter):
-        return _minimises(item)
-    if isinstance(item.rule, CovarianceIntersection | InverseCovarianceIntersection | ScalarWeights):
+    fusion = network.fused[name]
+    if isinstance(fusion, AbstractFilter):
+        return _minimises(fusion)
+    if isinstance(fusion.rule, CovarianceIntersection | InverseCovarianceIntersection | ScalarWeights):
         return True
-    return any(_minimises(network.nodes[n].filters[item.filter]) for n in network.nodes_with(item.filter))
+    return any(_minimises(network.nodes[n].filters[fusion.filter]) for n in network.nodes_with(fusion.filter))
 
 
-def _minimises(item: AbstractFilter) -> bool:
-    match item:
+def _minimises(filter: AbstractFilter) -> bool:
+    match filter:
         case GaussianFilter() | LinearFilter():
-            return bool(first(item.channel).uncertain)
+            return bool(first(filter.channel).uncertain)
         case PredictionFilter():
-            return _minimises(item.base)
+            return _minimises(filter.base)
         case SequentialFilter():
-            return any(_minimises(part) for part in item.filters)
+            return any(_minimises(node_filter) for node_filter in filter.filters)
     return False

@@ -13,13 +13,28 @@ import heliograph as hg
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import apply
+from heliograph_studies import Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo import robot
-from heliograph_studies.demo.learned import Learned, learn
-from heliograph_studies.demo.recording import PlazaRecording, read_recording
-from heliograph_studies.demo.scores import Score, score
-from heliograph_studies.demo.setting import Setting
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
+from heliograph_studies.demo.learned import Learned, Score, learn, score
+from heliograph_studies.demo.recording import PlazaRecording, find_recording, read_recording
+
+
+@dataclass(frozen=True)
+class Setting:
+    """recording: plaza1 or plaza2; `seeds` draws of the relays, the first with `seed`, which is shown in full."""
+
+    recording: str = "plaza2"
+    seeds: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_fields(self, seeds=1)
+        self.files()
+
+    def files(self) -> list[Path]:
+        """What is read."""
+        return [find_recording(self.recording)]
+
 
 NAMES = ("relay_aware", "extra_noise", "mean_gain", "perfect_channel", "open_loop")
 DESIGNS = {"centred": 1.0, "centred_thousandth": 1e-3}  # by what the sensor's power is multiplied
@@ -149,6 +164,7 @@ def designs(recording: PlazaRecording, scores: list[Score], seeds: range) -> dic
     see E (y - r)^2: near the start it is small, and on this drive a quarter throughout.
     """
     drive = robot.DRIVES[recording.name]
+    # r: the ranges at the known start; what is sent is y - r.
     reference = robot.RANGE_SCALE * np.linalg.norm(drive.start[:2] - drive.beacons, axis=1)
     plant, sensor = robot.model(drive, robot.Constants(drive.gyro_rate))
     channels = {name: channel_less(reference, power) for name, power in DESIGNS.items()}
@@ -157,11 +173,13 @@ def designs(recording: PlazaRecording, scores: list[Score], seeds: range) -> dic
         for name, channel in channels.items()
     }
     network = hg.Network(plant, nodes)
+    # The same draws of the relay for all designs.
     scored: dict[str, list[Score]] = {name: [] for name in DESIGNS}
     for seed in seeds:
         received = {name: relay(channel, recording.ranges, seed) for name, channel in channels.items()}
         for name, estimate in estimated(recording, network, received).items():
             scored[name].append(score(estimate, recording.truth))
+    # Powers E (y - r)^2 of what is sent.
     plain = _design(recording.ranges, np.zeros(len(reference)), 1.0, scores)
     less = {name: _design(recording.ranges, reference, power, scored[name]) for name, power in DESIGNS.items()}
     return {"as_it_is": plain, **less}

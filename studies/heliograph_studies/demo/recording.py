@@ -95,20 +95,24 @@ def read_recording(name: str = "plaza2") -> PlazaRecording:
     tables = loadmat(find_recording(name), variable_names=["GT", "DR", "TD", "TL"])
     truth, odometry, received, beacons = (tables[key] for key in ("GT", "DR", "TD", "TL"))
     clock = truth[:, 0]  # odometry row i is the increment from clock[i] to clock[i + 1]
+    # Rows in time order: ranges, and odometry where none comes for long.
     received = received[np.argsort(received[:, 0], kind="stable")]
     between = _without_ranges(clock, received[:, 0])
     rows = np.argsort(np.concatenate([received[:, 0], between]), kind="stable")
     time = np.concatenate([clock[:1], np.concatenate([received[:, 0], between])[rows]])
+    # Odometry and truth at the rows' times.
     sums = [np.interp(time, clock, np.concatenate([[0.0], np.cumsum(odometry[:, c])])) for c in (1, 2)]
     pose = np.column_stack([
         np.interp(time, clock, truth[:, 1]),
         np.interp(time, clock, truth[:, 2]),
         np.interp(time, clock, np.unwrap(truth[:, 3])) + BACKWARDS[name],
     ])  # fmt: skip
+    # One column for each beacon.
     columns = {beacon: c for c, beacon in enumerate(beacons[:, 0])}
     ranges = np.full((len(rows), len(beacons)), np.nan)
     ranges[np.arange(len(received)), [columns[beacon] for beacon in received[:, 2]]] = received[:, 3]
     ranges = ranges[rows]
+    # The gyro's rate at rest: its turn before the first motion.
     departure = int(np.argmax(odometry[:, 1] > MOVING))
     rate = float(odometry[:departure, 2].sum() / (clock[departure] - clock[0]))
     steps = np.column_stack([np.diff(sums[0]), np.diff(sums[1]), np.diff(time)])

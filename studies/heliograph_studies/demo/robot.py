@@ -1,6 +1,6 @@
 """A robot mower receives four radio beacons; each range reaches the remote filters through a two-hop relay.
 
-The constants come from the Plaza2 recording; `calibration` says how and computes them again. Of a drive elsewhere
+The constants come from the Plaza2 recording; the tests compute them again. Of a drive elsewhere
 (`plaza1`) only the place of its beacons, its start and what its gyro reads at rest are taken.
 """
 
@@ -13,6 +13,8 @@ import numpy as np
 
 import heliograph as hg
 
+CALIBRATED = "plaza2"  # the recording on which the constants were measured
+WINDOW = 100  # range rows over which odometry drift is measured: 22.6 s and 78 m on average
 RANGE_SCALE = 1.06974  # ranges on true distances, regression through the origin
 RANGE_VARIANCE = 0.31464  # m^2, mean squared residual of that regression
 POSITION_WALK = 2.0005e-3  # m^2 per metre and axis: drift along the true headings over 100 rows (22.6 s)

@@ -9,10 +9,79 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import fail
+from heliograph_studies import Inline, Stages, Unlisted, check_fields, sampled
 from heliograph_studies.cubature_fusion import setting as machine
-from heliograph_studies.fusion.setting import Part, Setting, described, moving_point, node_parts, received_by
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
+
+Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How much is worked out, and how much is simulated.
+
+    crossed_nodes: nodes of which all cross-covariances are computed over many_steps, as in a tree of tree_nodes and
+    degree;
+    intervals, thresholds: reports every d-th step and on event, over traffic_steps of which the second half is judged.
+    """
+
+    runs: int = 2000
+    steps: int = 200
+    measured_steps: int = 30
+    crossed_nodes: int = 1000
+    many_steps: int = 100
+    tree_nodes: int = 10_000
+    degree: int = 10
+    machine_runs: int = 256
+    machine_nodes: int = len(machine.NODES)
+    intervals: tuple[int, ...] = (1, 2, 3, 4, 6)
+    thresholds: tuple[float, ...] = (0.05, 0.15, 0.4)
+    traffic_steps: int = 36  # a multiple of all intervals
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_fields(self, runs=8, degree=2, tree_nodes=self.crossed_nodes, intervals=1)
+        check_fields(self, steps=1, measured_steps=1, crossed_nodes=1, many_steps=1, machine_runs=1, traffic_steps=1)
+        if not 2 <= self.machine_nodes <= len(machine.NODES):
+            raise fail("machine_nodes", f"a number from 2 to {len(machine.NODES)}", self.machine_nodes)
+        for d in self.intervals:
+            if self.traffic_steps % d:
+                raise fail("traffic_steps", f"a multiple of {d}", self.traffic_steps)
+
+
+def moving_point() -> hg.LinearPlant:
+    """Place and damped velocity in two directions."""
+    matrix = 0.98 * np.kron(np.eye(2), [[1, 1], [0, 0.97]])
+    noise = np.kron(np.eye(2), 0.02 * np.array([[1 / 3, 1 / 2], [1 / 2, 1]]))
+    return hg.LinearPlant(matrix, noise, np.zeros(4), np.eye(4), states=["x", "vx", "y", "vy"])
+
+
+def described(name: str) -> tuple[hg.LinearPlant, list[Part]]:
+    """Plant and nodes of a case."""
+    unit = np.eye(4)
+    if name == "three_rooms":
+        matrix = np.diag([0.9, 0.8, 0.95]) + 0.1 * np.diag([1, 1], 1)
+        rooms = hg.LinearPlant(matrix, 0.1 * np.eye(3), np.zeros(3), np.eye(3))
+        return rooms, [(np.eye(3)[[i]], 0.1, 0.8, 0.06, 0.05) for i in range(3)]
+    if name == "three_partial":
+        outputs = unit[[0]], unit[[2]], (unit[[0]] + unit[[2]]) / np.sqrt(2)
+        numbers = (0.8, 0.05), (0.9, 0.1), (0.7, 0.08)
+        return moving_point(), [(c, 0.2, *gain, 0.1) for c, gain in zip(outputs, numbers, strict=True)]
+    return moving_point(), [(unit[[0, 2]], 0.3, 0.8, 0.1, 0.2)] * 4
+
+
+def received_by(part: Part) -> tuple[hg.LinearSensor, hg.random_affine.AbstractRandomAffine]:
+    """Sensor and channel of a node; only mean and variance of the gain matter."""
+    matrix, noise, mean, variance, hop_noise = part
+    gain = hg.Discrete([mean - np.sqrt(variance), mean + np.sqrt(variance)], [0.5, 0.5])
+    return hg.LinearSensor(matrix, noise * np.eye(len(matrix))), hg.hop(gain, hop_noise * np.eye(len(matrix)))
+
+
+def node_parts(count: int, seed: int) -> list[Part]:
+    """Nodes with random outputs."""
+    draw = np.random.default_rng(seed)
+    return [(draw.normal(size=(2, 4)), 0.3, 0.75, 1 / 16, 0.2 + 0.2 * draw.random()) for _ in range(count)]
+
 
 CASES = {
     "three_partial": "three sensors that each see a part of a moving point",
@@ -104,9 +173,8 @@ def measured(setting: Setting) -> dict[str, dict[str, float]]:
 
 def against_peers(claimed: float, errors: np.ndarray) -> dict[str, float]:
     """The mean of squared errors (runs, n) with its standard error, beside what is claimed of it."""
-    square = np.sum(errors**2, axis=-1)
-    error = float(square.std(ddof=1) / np.sqrt(len(square)))
-    return {"claimed": float(claimed), "measured": float(square.mean()), "standard_error": error}
+    measured, error = sampled(np.sum(errors**2, axis=-1))
+    return {"claimed": float(claimed), "measured": measured, "standard_error": error}
 
 
 def tree(setting: Setting) -> tuple[dict[str, float], list[np.ndarray], dict[str, float]]:
@@ -150,6 +218,7 @@ def scale(setting: Setting) -> dict[str, float | None]:
     plant, parts = moving_point(), node_parts(setting.tree_nodes, setting.seed)
     numbers = {"output": np.array([part[0] for part in parts]), "noise": np.array([part[4] for part in parts])}
 
+    # A tree of relays over many leaves.
     def leaf(part: dict[str, Any]) -> hg.Node:
         sensor, gain = hg.LinearSensor(part["output"], 0.3 * np.eye(2)), hg.Discrete([0.5, 1.0], [0.5, 0.5])
         channel = hg.hop(gain, part["noise"] * np.eye(2))
@@ -159,6 +228,7 @@ def scale(setting: Setting) -> dict[str, float | None]:
     grown = hg.simulation.relay_tree(plant, leaf, numbers, setting.degree, setting.many_steps)
     tree_took, tree_peak = _since(begin), peak_gb()
     begin = time.perf_counter(), time.process_time()
+    # All cross-covariances of fewer nodes, and their matrix weights.
     crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.crossed_nodes]), LOCAL, setting.many_steps)
     pairs, (_, covariance) = crossed.joint, crossed.matrix_weights()
     took = _since(begin)
@@ -215,6 +285,7 @@ def strong(setting: Setting) -> dict[str, Any]:
 def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
     """Three rooms whose nodes report every d-th step, or on event: reports per step and node, error, and claim."""
     plant, parts = described("three_rooms")
+    # Reports every d-th step, or where the estimate has moved by a threshold.
     every = {f"every {d}": hg.fusion.ReportLink(every=d) for d in setting.intervals}
     fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
         name: hg.Fusion(LOCAL, hg.fusion.AllReports(), uplink=link) for name, link in every.items()
@@ -226,6 +297,7 @@ def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
             fused[name] = hg.Fusion(LOCAL, hg.fusion.AllReports(), quantizer=sends)
     net = hg.Network(plant, network(plant, parts).nodes, fused)
     sums = hg.monte_carlo(net, setting.traffic_steps, setting.runs // 4, setting.seed, hg.Statistics())["fused"]
+    # Averages over the second half of the steps.
     result: dict[str, list[dict[str, float]]] = {"every": [], "informed": [], "uninformed": []}
     late = slice(setting.traffic_steps // 2, None)
     for name, item in sums.items():

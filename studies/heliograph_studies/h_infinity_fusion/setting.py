@@ -3,12 +3,19 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph_studies import check_fields
+from heliograph_studies.h_infinity_fusion.worst_disturbance import Draws
 
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2")
@@ -62,10 +69,7 @@ class Setting:
     zoom: float = 0.1
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 100)  # with fewer a standard error means little
-        check_seed("seed", self.seed)
-        check_count("steps", self.steps, 8)
-        check_count("segments", self.segments, 2)
+        check_fields(self, runs=100, steps=8, segments=2)  # with fewer runs a standard error means little
         for name, low, high in (("growth", 0, np.inf), ("weight", 0, np.inf), ("initial", 0, np.inf), ("decay", 0, 1)):
             if not low < getattr(self, name) < high:
                 raise fail(name, f"a number between {low:g} and {high:g}", getattr(self, name))
@@ -160,6 +164,17 @@ class Setting:
         powers = np.array(self.noise_gain) ** 2 * np.mean(self.channel_noises**2, axis=0)
         return self.channel([float(p) for p in powers], hop)
 
+    def draws(self, count: int, seed: int) -> Draws:
+        """Arrivals of `count` runs as gains, sqrt(E1 E2) b1 b2 y + sqrt(E2) b2 n1 + n2 and sqrt(E3) b3 y + n3."""
+        arrived = np.random.default_rng(seed).random((count, self.steps, 3)) < self.arrival
+        first, second, direct = np.moveaxis(arrived.astype(float), -1, 0)
+        zero, item = np.zeros_like(first), np.ones_like(first)
+        c, e = self.noise_gain, np.sqrt(self.powers)
+        gain = np.stack([e[0] * e[1] * first * second, e[2] * direct], axis=-1)[..., None]
+        relayed = np.stack([e[1] * second * c[0], c[1] * item, zero], axis=-1)
+        straight = np.stack([zero, zero, c[2] * item], axis=-1)
+        return Draws(gain, np.stack([relayed, straight], axis=-2))
+
     def system(
         self, node: int, growth: Constant | tuple[Constant, Constant] | None = None, hop: Hop | None = None
     ) -> hg.h_infinity.GrowthSystem:
@@ -168,3 +183,45 @@ class Setting:
             self.steps, self.B, [[self.feedthrough[node]]], self.M, self.unit_channel(hop),
             self.growth if growth is None else growth, self.output_growth(node), initial_weight=self.weight,
         )  # fmt: skip
+
+
+class ZoomQuantizer(AbstractQuantizer):
+    """A uniform quantizer with the amplitude d+ = decay d + growth x^2.
+
+    As published: driven by the unquantized x, which a fusion centre does not know, so nobody there can decode it; and d
+    saturates for every constant |x| below (1 - decay) / (growth scale), since it tends to growth x^2 / (1 - decay).
+    `hg.fusion.EscapeQuantizer` has neither fault.
+
+    Raises:
+        ValueError: fewer than two levels, an amplitude that is not positive, decay outside (0, 1), negative growth.
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10) to (13).
+    """
+
+    uniform: hg.fusion.UniformQuantizer
+    decay: np.ndarray
+    growth: np.ndarray
+
+    def __init__(self, levels: int, amplitude: ArrayLike, decay: float, growth: float):
+        self.uniform = hg.fusion.UniformQuantizer(levels, amplitude)
+        if not 0 < decay < 1:
+            raise fail("decay", "a number between 0 and 1", decay)
+        if growth < 0:
+            raise fail("growth", "no negative number", growth)
+        self.decay, self.growth = np.asarray(decay), np.asarray(growth)
+
+    @in_float64
+    def init(self, n: int) -> jax.Array:
+        """The first amplitude (n,)."""
+        return jnp.broadcast_to(jnp.asarray(self.uniform.amplitude), (n,))
+
+    @in_float64
+    def step(self, state: ArrayLike, value: ArrayLike) -> tuple[jax.Array, Quantized]:
+        """Quantize with the present amplitude; the next one follows x."""
+        x, amplitude = jnp.asarray(value, dtype=float), jnp.asarray(state, dtype=float)
+        following = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)
+        _, sent = eqx.tree_at(lambda q: q.amplitude, self.uniform, amplitude).step((), x)
+        return following, sent
+
+    def claim(self, claim: Claim) -> Claim:
+        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
+        return weakest([claim, "nominal"])

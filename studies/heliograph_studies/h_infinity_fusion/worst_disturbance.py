@@ -103,6 +103,7 @@ def _climb(
 
     def single(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
         def improve(w: Disturbance, _: None) -> tuple[Disturbance, jax.Array]:
+            # The gradient of E sum |M e|^2 at the same energy, and the best point on the way there.
             uphill = _scaled(world, _raised(world, jax.grad(gained)(w)), energy)
             tries = jax.vmap(lambda t: _scaled(world, _between(w, uphill, t), energy))(jnp.append(0.0, SHARES))
             values = jax.lax.map(gained, tries)

@@ -11,9 +11,9 @@ import heliograph as hg
 from heliograph.linear import CriticalArrival
 from heliograph.random_affine import AbstractRandomAffine
 from heliograph.simulation import Boundedness
+from heliograph_studies import Sampled, Stages, Unlisted
 from heliograph_studies.intermittent_observations.mean_error import (
     Iterated,
-    Simulated,
     from_runs,
     iterate,
     mean_error,
@@ -28,8 +28,6 @@ from heliograph_studies.intermittent_observations.setting import (
     lossy,
     threshold,
 )
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
 
 APART = 0.005  # how far from a threshold verdicts are asked for
 
@@ -45,7 +43,7 @@ class Link(NamedTuple):
     judged: Boundedness
     lower: float
     mean_error: float
-    simulated: Simulated
+    simulated: Sampled
 
     @property
     def bound(self) -> float:
@@ -63,9 +61,9 @@ class Link(NamedTuple):
             "lower": self.lower,
             "radius": self.judged.radius,
             "gain": gain[:, 0] if len(gain) > 1 else float(gain[0, 0]),
-            "mean_error": self.mean_error if exact else self.simulated.mean,
+            "mean_error": self.mean_error if exact else self.simulated.value,
             "mean_error_is": "quadrature" if exact else "simulated",
-            "simulated": self.simulated.mean,
+            "simulated": self.simulated.value,
             "simulated_se": self.simulated.error,
         }
 
@@ -126,11 +124,15 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 def thresholds(setting: Setting) -> dict[str, Any]:
     """Critical arrivals and recoveries, and verdicts on either side of them."""
     scalar, always = setting.scalar, judge(setting.scalar, lossy(1.0))
+
+    def recovery(fail: float) -> float:
+        return _smallest(lambda recover: judge(scalar, bursts(fail, recover)), setting.digits)
+
     steady = always.gains[(True,) * len(scalar.output)]  # certified where every packet arrives
     return {
         "critical": {name: hg.linear.critical_arrival(e.plant(), e.sensor()) for name, e in setting.examples.items()},
         "constant": hg.linear.critical_arrival(scalar.plant(), scalar.sensor(), steady),
-        "recovery": {fail: critical_recovery(setting, fail) for fail in (0.01, 0.1, 0.5)},
+        "recovery": {fail: recovery(fail) for fail in (0.01, 0.1, 0.5)},
         "components": (critical_component(setting, 0), critical_component(setting, 1)),
         "verdicts": verdicts(setting),
     }
@@ -214,11 +216,6 @@ def lower(example: Example, fail: float, recover: float) -> float:
     start = (lost * q).ravel()  # fail w_0 + (1 - recover) w_1 = w_1
     s = np.linalg.solve(np.eye(n * n) - (1 - recover) * square, start).reshape(n, n)
     return float(np.trace(s + recover * a @ s @ a.T + (1 - lost) * q))
-
-
-def critical_recovery(setting: Setting, fail: float) -> float:
-    """The smallest probability of recovery at which the scalar example is certified, by bisection on verdicts."""
-    return _smallest(lambda recover: judge(setting.scalar, bursts(fail, recover)), setting.digits)
 
 
 def critical_component(setting: Setting, which: int) -> float:

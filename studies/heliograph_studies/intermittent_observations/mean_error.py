@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from heliograph_studies import Sampled, sampled
 from heliograph_studies.intermittent_observations.setting import Example
 
 DEGREE, LOSSES, SQUARINGS = 40, 400, 8  # of the polynomials; in a row; of the map from arrival to arrival
@@ -18,31 +19,28 @@ def mean_error(example: Example, fail: float, recover: float) -> float:
     mean of x + g(x) + ... + g^l(x) over that of l + 1.
     """
     a, c, q, r = (float(np.squeeze(v)) for v in (example.transition, example.output, example.process, example.noise))
+    # g^l(x) = a^(2 l) x + q (a^(2 l) - 1) / (a^2 - 1), and the law of l.
     lasts = np.arange(LOSSES)
     after = np.where(lasts == 0, 1.0, fail * (1 - recover) ** np.maximum(lasts - 1.0, 0.0))  # P(l >= lasts)
     growth = (a * a) ** lasts.astype(float)
     added = q * (growth - 1) / (a * a - 1)
+    # Chebyshev nodes over where P lies after an arrival.
     low, high = q, a * a * r / c**2 + q
     nodes = np.cos(np.pi * (np.arange(DEGREE) + 0.5) / DEGREE)
     before = (low + (high - low) * (nodes + 1) / 2)[:, None] * growth + added
+    # h(g^l(x)): P after the next arrival, and the map of polynomials that its law is.
     following = a * a * before * r / (c * c * before + r) + q
     values = chebyshev.chebvander(2 * (following - low) / (high - low) - 1, DEGREE - 1)
     mean_values = np.einsum("l,xld->xd", after - np.append(after[1:], 0.0), values)
     onward = np.linalg.solve(chebyshev.chebvander(nodes, DEGREE - 1), mean_values)
+    # The map after long: its fixed law; then the mean over the losses that follow.
     for _ in range(SQUARINGS):
         onward = onward @ onward
     mean = low + (high - low) * (onward[0, 1] + 1) / 2  # of any polynomial, in its constant coefficient after long
     return float((mean * after @ growth + after @ added) / after.sum())
 
 
-class Simulated(NamedTuple):
-    """A mean over runs and its standard error."""
-
-    mean: float
-    error: float
-
-
-def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarray, arrived: np.ndarray) -> Simulated:
+def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarray, arrived: np.ndarray) -> Sampled:
     """tr E P before z from the filter's covariances after z (run, time, n, n) in the steps that had one (run, time).
 
     What losses do is known: with D the part of E P before an arrival, L before a loss, w the share of losses and h(P)
@@ -62,7 +60,7 @@ def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarra
         return np.asarray(np.trace(before_loss + (1 - fail) * received + recover * following_loss, axis1=1, axis2=2))
 
     result = total(following.mean(axis=1))  # linear in what was received, so that each run gives one value
-    return Simulated(float(result.mean()), float(result.std(ddof=1) / np.sqrt(len(result))))
+    return sampled(result)
 
 
 def over_patterns(example: Example, arrival: float, steps: int) -> np.ndarray:

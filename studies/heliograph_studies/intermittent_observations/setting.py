@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.check import fail
+from heliograph_studies import check_fields
 
 NODE, FILTER = "receiver", "informed"
 
@@ -79,20 +80,13 @@ class Setting:
     turning: Example = TURNING
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 100)
-        check_seed("seed", self.seed)
-        for name, least in (("horizon", 2), ("patterns", 4), ("iterations", 4), ("points", 2)):
-            check_count(name, getattr(self, name), least)
-        for name in ("arrival", "between"):
-            scalar(name, getattr(self, name), 0.0, 1.0)
-        scalar("digits", self.digits, 1e-12, 0.1)
+        check_fields(self, runs=100, horizon=2, patterns=4, iterations=4, points=2)
+        check_fields(self, arrival=(0.0, 1.0), between=(0.0, 1.0), digits=(1e-12, 0.1))
         if not 0 <= self.begin < self.horizon:
             raise fail("begin", f"a step from 0 to {self.horizon - 1}", self.begin)
         for name in ("scalar", "coupled", "components", "turning"):
-            if largest(getattr(self, name)) <= 1:
-                raise fail(
-                    f"{name}.transition", "an unstable plant", f"eigenvalues up to {largest(getattr(self, name)):g}"
-                )
+            if (size := largest(getattr(self, name))) <= 1:
+                raise fail(f"{name}.transition", "an unstable plant", f"eigenvalues up to {size:g}")
 
     @property
     def examples(self) -> dict[str, Example]:

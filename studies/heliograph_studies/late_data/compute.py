@@ -10,15 +10,33 @@ import numpy as np
 
 from heliograph.live.timeline import Timeline
 from heliograph.numerics.check import fail
+from heliograph_studies import NO_FILE, File, Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.late_data import moving, plaza
-from heliograph_studies.late_data.packets import Packets, Statistics, statistics
+from heliograph_studies.late_data.packets import Packets, Statistics, read_trace, statistics, synthetic_packets
 from heliograph_studies.late_data.replay import METHODS, Estimated, every_method, squared_errors
-from heliograph_studies.late_data.setting import Setting
-from heliograph_studies.late_data.synthetic import synthetic_packets
-from heliograph_studies.late_data.trace import read_trace
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.stages import Stages
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The network is that of a log at path `trace`, or one with the statistics of a recorded one over `network_s`.
+
+    runs: paths of the moving point, each over `duration` seconds.
+    """
+
+    runs: int = 10
+    duration: float = 900.0
+    network_s: float = 3600.0
+    trace: File = NO_FILE
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_fields(self, runs=1)
+        for name in ("duration", "network_s"):
+            if not 1.0 <= getattr(self, name) < float("inf"):
+                raise fail(name, "seconds, one or more", getattr(self, name))
+        object.__setattr__(self, "trace", File(self.trace))  # of a path in any form
+
 
 FEWEST = 2  # packets in the stretch that is used
 Errors = dict[str, tuple[np.ndarray, np.ndarray]]  # by method: squared, and in units of the claim

@@ -48,12 +48,14 @@ def world(packets: Packets, duration: float, seed: int) -> tuple[list[Event], np
     """What the packets hold, and the true position at each of the times returned beside it."""
     generator = np.random.default_rng(seed)
     times = np.unique(np.concatenate([packets.sent, moments(duration), [0.0]]))
+    # The path: white acceleration over each interval.
     state, path = generator.normal(size=(2, 2)), np.zeros((len(times), 2))  # (position and velocity, axis)
     for i, dt in enumerate(np.diff(times, prepend=0.0)):
         item = PUSH * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         push = np.linalg.cholesky(item + 1e-30 * np.eye(2)) @ generator.normal(size=(2, 2)) if dt else 0.0
         state = np.array([[1.0, dt], [0.0, 1.0]]) @ state + push
         path[i] = state[0]
+    # What each packet holds: the position when it was sent, and noise.
     local = packets.first_received()
     noise = dict.fromkeys(zip(packets.node, packets.sequence, packets.sent, strict=True))
     for name in noise:  # a copy holds what the first one does

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+import heliograph as hg
 from heliograph.live.event import VERDICTS, Event
 from heliograph.live.timeline import Timeline
 from heliograph.model.estimate import Estimate
@@ -89,6 +90,5 @@ def _stacked(parts: Sequence[tuple[float, Estimate]]) -> Estimated:
 
 def squared_errors(estimated: Estimated, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """|e|^2 and e' P^-1 e / 2 of the first two states at each moment; truth (moment, 2)."""
-    error = (estimated.mean[:, :2] - truth)[:, :, None]
-    weighted = np.linalg.solve(estimated.covariance[:, :2, :2], error)
-    return np.sum(error**2, axis=(1, 2)), np.sum(error * weighted, axis=(1, 2)) / 2
+    place = estimated.mean[:, :2]
+    return np.sum((place - truth) ** 2, axis=1), hg.nees(truth, place, estimated.covariance[:, :2, :2]) / 2

@@ -9,20 +9,22 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.live.plant import Link
 from heliograph.live.plant_codec import plant_from
+from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import identity
+from heliograph_studies import Stages, Unlisted
+from heliograph_studies.curves import Curve, paths
+from heliograph_studies.live import Setting
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, Killed, killed, left_alone
 from heliograph_studies.live.mower import PLANT, Drive, network, read_drive
 from heliograph_studies.live.server import Server, find_server
-from heliograph_studies.live.setting import Setting
 from heliograph_studies.live.speed import in_memory, many_plants, through
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
 
 Links = dict[str, Link]  # by node, what the store says that came from it
 
@@ -51,11 +53,6 @@ class Outcome:
     truth: Unlisted[np.ndarray]
     beacons: Unlisted[np.ndarray]
     pictures: Unlisted[dict[str, bytes]]
-
-    def draw(self, folder: Path) -> None:
-        """Write the pictures of the page."""
-        for name, picture in self.pictures.items():
-            (folder / f"{name}.png").write_bytes(picture)
 
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
@@ -133,3 +130,20 @@ def differences(alone: Links, killed: Links) -> tuple[int, int]:
     """Messages that were used by a service left alone and not by the one killed, and those used more often."""
     pairs = [(link.used, killed[node].used) for node, link in alone.items()]
     return sum(max(0, a - b) for a, b in pairs), sum(max(0, b - a) for a, b in pairs)
+
+
+def figures(outcome: Outcome) -> dict[str, Figure]:
+    """The path of the final estimates, on its map."""
+    path = Curve(f"final estimates: {outcome.position_rmse_m:.2f} m off", BLUE, outcome.mean[:, :2])
+    return {"map": paths(outcome.truth, [path], outcome.beacons)}
+
+
+def words(outcome: Outcome) -> dict[str, object]:
+    """Colours, and how long late messages are waited for."""
+    return {"blue": BLUE, "green": GREEN, "vermilion": VERMILION, "window": WINDOW}
+
+
+def data(outcome: Outcome, folder: Path) -> None:
+    """Write the pictures of the page."""
+    for name, picture in outcome.pictures.items():
+        (folder / f"{name}.png").write_bytes(picture)

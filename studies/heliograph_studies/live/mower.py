@@ -9,8 +9,8 @@ import heliograph as hg
 from heliograph.live.event import Event
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.late_data import plaza
+from heliograph_studies.late_data.packets import synthetic_packets
 from heliograph_studies.late_data.replay import arrival_of
-from heliograph_studies.late_data.synthetic import synthetic_packets
 
 PLANT = "mower"
 SERVED = f"{__name__}:network"

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed, scalar
 from heliograph.planning.paths.model import Paths
+from heliograph_studies import check_fields
 
 TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 PROCESS = np.diag([0.1, 0.05, 0.2])
@@ -17,10 +17,6 @@ NEAR, FAR = np.array([1.2, 0.7, 1.9, 1.0, 1.5, 0.5]), np.array([0.8, 1.6, 0.6, 1
 KAPPA = np.array([1.02, 1.05, 1.02, 1.1, 1.02, 1.05])  # E g^2 / (E g)^2 of a single hop
 RELAYED_KAPPA = 1.02
 NAMES = tuple("abcdef")
-
-VARIANCE = 4e-6  # of the circuit's noises
-SPREAD = 0.01  # of its gains
-QUIET = {"relay_1": (1, (0.39, -0.21, 0.033)), "relay_2": (0, (0.84, -0.42, 0.13))}  # the slot and gains to begin from
 
 
 @dataclass(frozen=True)
@@ -45,15 +41,9 @@ class Setting:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + check_count("seeds", self.seeds) - 1)
-        for name in ("one_hop", "two_hops", "front", "on", "chosen", "rho"):
-            for power in np.atleast_1d(getattr(self, name)):
-                scalar(name, power, np.finfo(float).tiny)
-        for period in self.periods:
-            check_count("periods", period)
-        for times in self.losses:
-            scalar("losses", times, 1.0)
-        scalar("exponent", self.exponent, 1.0)
+        power = (np.finfo(float).tiny,)
+        check_fields(self, one_hop=power, two_hops=power, front=power, on=power, chosen=power, rho=power)
+        check_fields(self, seeds=1, periods=1, losses=(1.0,), exponent=(1.0,))
 
 
 def gain(kappa: float, length: float) -> hg.Discrete:
@@ -79,23 +69,3 @@ def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
 def slow_state() -> Paths:
     """A state that hardly moves, received over two hops without fading."""
     return hg.planning.independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
-
-
-def circuit() -> hg.model.RelayNetwork:
-    """Two relays in turn that filter and forward what they receive of a circuit, as published."""
-    drive = np.array([[0.6], [0.5], [0.3]])
-    plant = hg.LinearPlant(
-        [[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]],
-        VARIANCE * drive @ drive.T,
-        [0.3, 0.2, -0.2],
-        np.diag([0.05, 0.02, 0.03]),
-    )
-    sensor = hg.LinearSensor([[2.0, 1.8, 2.5]], 0.36 * VARIANCE)
-
-    def link(mean: float, noise: float = VARIANCE) -> hg.random_affine.GainAndNoise:
-        squared = np.log(1 + SPREAD / mean**2)
-        return hg.hop(hg.random_affine.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
-
-    odd = {"relay_2": {"sensor": link(0.92), "relay_1": link(0.9, 0.0)}, "receiver": {"relay_1": link(0.9)}}
-    even = {"relay_1": {"sensor": link(0.9), "relay_2": link(0.9, 0.0)}, "receiver": {"relay_2": link(0.92)}}
-    return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), (odd, even))

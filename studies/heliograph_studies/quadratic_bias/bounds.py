@@ -69,6 +69,7 @@ def boundedness(system: LinearSystem, window: int | None = None) -> Boundedness:
     if not 1 <= window < system.horizon:
         raise fail("window", f"from 1 to {system.horizon - 1} steps", window)
     c, before = _constants(system), state_moments(system).covariance
+    # Error covariances of the best filter, and their extreme eigenvalues.
     errors = [system.covariance]
     for k in range(system.horizon):
         errors.append(covariance_step(errors[-1], system.step(k)).covariance)

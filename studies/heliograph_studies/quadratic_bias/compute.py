@@ -1,6 +1,5 @@
 """All numbers of the reproduction: designed covariances, Monte Carlo on the library's driver, bounds, one run."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,17 +9,50 @@ import numpy as np
 import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
 from heliograph.filters.linear.polynomial import MemoryFilter
-from heliograph.linear import lifted_system
+from heliograph.linear.lift import lifted_system
 from heliograph.linear.polynomial import memory_system, skewness
-from heliograph.linear.recursion import lmmse
-from heliograph.linear.system import Schedule
+from heliograph.linear.recursion import lmmse, true_covariance
+from heliograph.linear.system import LinearSystem, Schedule, state_moments
+from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.random_affine.combine import known
 from heliograph.simulation import ErrorStatistics
-from heliograph_studies.outcome import Inline, Unlisted
+from heliograph_studies import Inline, Stages, Unlisted
 from heliograph_studies.quadratic_bias.bounds import Boundedness, boundedness
-from heliograph_studies.quadratic_bias.printed import Printed, printed_quadratic
 from heliograph_studies.quadratic_bias.setting import Model, Setting
-from heliograph_studies.stages import Stages
+
+
+class Printed(NamedTuple):
+    """The printed filter: its gains with what it claims, and the covariance (time, n, n) that it has."""
+
+    schedule: Schedule
+    true_covariance: np.ndarray
+
+
+def printed_quadratic(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> Printed:
+    """Gains, claimed covariance (36) and true covariance of (14) with (30), (31) and (35), Lemma 4 corrected."""
+    square = lifted_system(plant, sensor, channel, 2, horizon)
+    schedule = lmmse(believed(square, lifted_system(plant, sensor, channel, 1, horizon)), "nominal")
+    return Printed(schedule, true_covariance(square, schedule))
+
+
+def believed(square: LinearSystem, linear: LinearSystem) -> LinearSystem:
+    """The system that the paper believes in, from the true one of degree 2 and that of degree 1.
+
+    E[z z' | x] is taken as (mean gain)^2 x x' plus a constant (printed: theta^2 mu^2, true: theta^2 E[l m]). What is
+    left over, D Y + V with D = C - C_printed, has the right covariance D Cov(Y) D' + Cov(V), but it is no longer
+    uncorrelated with Y.
+    """
+    before, s = state_moments(square), linear.steps
+    output = np.array([known(c, o).moments(2).matrix[:-1, :-1] for c, o in zip(s.output, s.offset, strict=True)])
+    gap = square.steps.output - output
+    offset = square.steps.offset + np.einsum("tij,tj->ti", gap, before.mean[1:])
+    noise = square.steps.noise + gap @ before.covariance[1:] @ np.swapaxes(gap, 1, 2)
+    steps = square.steps._replace(output=output, offset=offset, noise=noise)
+    return LinearSystem(steps, square.mean, square.covariance, square.projection, square.rounding)
+
 
 RESOLUTION = 0.01  # of z for the mixture filter, where a link that is off leaves z with a few exact values
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3, "quartic": 4}
@@ -103,15 +135,12 @@ def design(model: Model, resolution: float) -> Designs:
     printed = printed_quadratic(*parts, model.horizon)
     filters[TRUE] = PolynomialFilter(ScheduledFilter(printed.schedule), 2)
     filters["mixture"] = hg.filters.mixture_filter(*parts, resolution)
-    covariance = _covariances(model, schedules | {"memory": memory}, printed)
-    return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
-
-
-def _covariances(model: Model, schedules: Mapping[str, Schedule], printed: Printed) -> dict[str, np.ndarray]:
-    start = first(model.plant).initial_covariance[None]
-    steps = {name: schedule.gains.covariance for name, schedule in schedules.items()}
+    # What is known before any run, from the covariance of the initial state on.
+    steps = {name: schedule.gains.covariance for name, schedule in (schedules | {"memory": memory}).items()}
     steps |= {CLAIMED: printed.schedule.gains.covariance, TRUE: printed.true_covariance}
-    return {name: np.concatenate([start, value]) for name, value in steps.items()}
+    start = first(model.plant).initial_covariance[None]
+    covariance = {name: np.concatenate([start, value]) for name, value in steps.items()}
+    return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
 
 
 def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -> Numbers:
@@ -124,8 +153,10 @@ def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -
     def named(values: np.ndarray, suffix: str = "") -> dict[str, float]:
         return {f"{state}{suffix}": value.tolist() for state, value in zip(model.states, values, strict=True)}
 
+    # Designed: variances over time, and their means over the steps that count.
     variances = {name: np.diagonal(value, axis1=1, axis2=2) for name, value in designs.covariance.items()}
     means = {name: value[model.begin + 1 :].mean(axis=0) for name, value in variances.items()}
+    # Simulated on the same runs, and their differences to the linear filter.
     squares = {name: _mean_square(part, None, model.begin) for name, part in sums[NODE].items()}
     simulated: dict[str, dict[str, Any]] = {}
     for name, part in sums[NODE].items():

@@ -11,8 +11,9 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import check_count, fail
 from heliograph.random_affine import FiniteSupport, GainAndNoise, Independent, Shaped
+from heliograph_studies import check_fields
 
 C, D = np.array([[0.2, 0.18]]), np.array([[0.01]])
 B = np.array([[0.05], [0.1]])
@@ -103,8 +104,7 @@ class Setting:
     channel: Channel | None = None
 
     def __post_init__(self) -> None:
-        check_count("runs", self.runs, 100)  # standard errors come from batches of runs
-        check_seed("seed", self.seed)
+        check_fields(self, runs=100)  # standard errors come from batches of runs
         for name, part in (("", self), ("outages.", self.outages)):
             check_count(f"{name}horizon", part.horizon, 8)
             if not 0 <= part.begin < part.horizon:

@@ -72,16 +72,19 @@ def certify_relays(network: RelayNetwork, gains: GainsByFilter) -> RelayCertific
     horizon = len(result.state) - 1
     steps = network.steps(horizon)
     c = _constants(network, steps)
+    # Eigenvalues of the error covariances, relays and receiver.
     relays = np.array([np.linalg.eigvalsh(result.covariance[name]) for name in network.relays])
     receiver = np.linalg.eigvalsh(result.covariance[RECEIVER])
     greedy = _greedy(result)
+    # mbar_k = tau mbar_(k-1) + w bounds all of them from above.
     upper = _recursion(c["p0_upper"], np.full(horizon, c["tau_upper"]), c["w_upper"])
+    relay_lower, receiver_lower = _over_time(c, upper, relays, receiver, greedy)
     bounds = [
         _state_bound(steps, result, greedy),
-        _above("Theorem 3, upper", "(33)", (greedy,), upper, relays),
-        _relay_lower(c, upper, relays, greedy),
-        _above("Theorem 4, upper", "(54)", (greedy,), upper, receiver),
-        _receiver_lower(c, upper, receiver, greedy),
+        _bound("Theorem 3, upper", "(33)", (greedy,), upper, relays),
+        relay_lower,
+        _bound("Theorem 4, upper", "(54)", (greedy,), upper, receiver),
+        receiver_lower,
         *_uniform(c, relays, receiver, greedy, horizon),
     ]
     return RelayCertificate({bound.name: bound for bound in bounds}, c, result)
@@ -117,6 +120,7 @@ def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
     def gram(a: Float[np.ndarray, "time n m"]) -> Float[np.ndarray, "time n n"]:
         return np.asarray(a @ np.swapaxes(a, 1, 2))
 
+    # Extreme eigenvalues of A A', C C', W, P_0 and V.
     tau, f, w = extremes(gram(steps.transition)), extremes(gram(steps.sensing)), extremes(steps.process)
     p0, v = extremes(network.initial()[1][None]), extremes(steps.sensor_noise)
     mu, phi, g, o = _link_constants(network, len(steps.live))
@@ -140,6 +144,7 @@ def _link_constants(
     for k in range(horizon):
         for listener, links in network.slots[k % len(network.slots)].items():
             senders, noise = set(links), np.zeros(())
+            # Of the published kind: a relay receives the sensor and one relay, the receiver one relay.
             published = senders < {SENSOR, *network.relays} and len(senders - {SENSOR}) == 1 and listener not in senders
             if not published or (SENSOR in senders) != (listener != RECEIVER):
                 return nothing
@@ -149,6 +154,7 @@ def _link_constants(
                 m = len(offset)
                 mean, variance = gain[0, 0], spread[0, 0, 0, 0]
                 shape = np.einsum("ia,jb->ijab", np.eye(m), np.eye(m))
+                # Over scalar gains: one mean and one variance, whatever the component.
                 square = spread.shape == (m, m, m + 1, m + 1)
                 if not square or np.any(offset) or not np.allclose(gain, mean * np.eye(m)):
                     return nothing
@@ -183,64 +189,58 @@ def _recursion(start: float, factors: Float[np.ndarray, "steps"], constant: floa
     return np.array(values)
 
 
-def _above(
-    name: str,
-    source: str,
-    assumptions: Iterable[Assumption],
-    values: Float[np.ndarray, "time"],
-    eigenvalues: np.ndarray,
+def _bound(
+    name: str, source: str, assumptions: Iterable[Assumption], values: np.ndarray | None, eigenvalues: np.ndarray
 ) -> Bound:
-    holds = bool(np.all(eigenvalues[..., -1] <= values * (1 + ROUNDING)))
-    return Bound(name, source, tuple(assumptions), values, holds)
+    """A bound, from below if its name says so, and whether eigenvalues (..., time, n) obey it; no value, no verdict."""
+    if values is None:
+        return Bound(name, source, tuple(assumptions), None, None)
+    if "lower" in name:
+        holds = eigenvalues[..., 0] >= values - ROUNDING * eigenvalues[..., -1]
+    else:
+        holds = eigenvalues[..., -1] <= values * (1 + ROUNDING)
+    return Bound(name, source, tuple(assumptions), values, bool(np.all(holds)))
 
 
-def _below(
-    name: str,
-    source: str,
-    assumptions: Iterable[Assumption],
-    values: Float[np.ndarray, "time"],
-    eigenvalues: np.ndarray,
-) -> Bound:
-    slack = ROUNDING * eigenvalues[..., -1]
-    holds = bool(np.all(eigenvalues[..., 0] >= values - slack))
-    return Bound(name, source, tuple(assumptions), values, holds)
+class _Lower(NamedTuple):
+    """What lower bounds are made of, over an upper bound mbar: rho and alpha, w that is left, n - c mbar / s > 0."""
+
+    rho: np.ndarray
+    alpha: np.ndarray
+    left: float
+    above: np.ndarray
+    printed: np.ndarray
 
 
-def _lower_condition(
-    c: dict[str, float], upper: Float[np.ndarray, "steps"]
-) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"], Float[np.ndarray, "steps"], float]:
-    """n - c m / s and n + c m of the lower bound, the printed n - c m mu^2 / phi, and the part of w that is left."""
-    mu, phi = c["mu_upper"], c["phi_lower"]
+def _lower(c: dict[str, float], upper: Float[np.ndarray, "steps"]) -> _Lower:
+    """rho = tau (n - c mbar / s) / (n + c mbar), alpha = tau o / (o + 4 mu^2 f mbar); printed 1 / s is mu^2 / phi."""
+    mu, phi, f = c["mu_upper"], c["phi_lower"], c["f_upper"]
     s = phi / (2 * mu**2)
+    # n bounds the innovation from below, c mbar its part from the other relay from above.
     n = (c["mu_lower"] ** 2 + phi) * (c["f_lower"] * c["w_lower"] + c["v_lower"]) + c["g_lower"]
-    weight = 2 * mu**2 * c["f_upper"] * (2 * c["tau_upper"] + 3) * upper
-    left = (phi - s * mu**2) / (phi + mu**2)
-    return n - weight / s if s else n - np.inf * weight, n + weight, n - weight * (mu**2 / phi if phi else np.inf), left
+    weight = 2 * mu**2 * f * (2 * c["tau_upper"] + 3) * upper
+    above, left = n - weight / s if s else n - np.inf * weight, (phi - s * mu**2) / (phi + mu**2)
+    alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * mu**2 * f * upper)
+    printed = n - weight * (mu**2 / phi if phi else np.inf)
+    return _Lower(c["tau_lower"] * above / (n + weight), alpha, left, above, printed)
 
 
-def _relay_lower(c: dict[str, float], upper: np.ndarray, relays: np.ndarray, greedy: Assumption) -> Bound:
-    """m_k = rho_(k-1) m_(k-1) + left w, rho = tau (n - c m / s) / (n + c m), where n - c m / s > 0."""
+def _over_time(
+    c: dict[str, float], upper: np.ndarray, relays: np.ndarray, receiver: np.ndarray, greedy: Assumption
+) -> list[Bound]:
+    """Lower bounds at each step: m_k = rho_(k-1) m_(k-1) + left w of a relay, p_k = alpha_(k-1) p_(k-1) + w."""
     structure = _structure(c)
+    names = ("Theorem 3, lower", "(34)", relays), ("Theorem 4, lower", "(52)", receiver)
     if not structure.met:
-        return Bound("Theorem 3, lower", "(34)", (structure, greedy), None, None)
-    above, below, printed, left = _lower_condition(c, upper[:-1])
-    result = f"{above[0]:.4g} at k = 1 (printed form {printed[0]:.4g}), least {above.min():.4g}"
-    condition = Assumption("n - c mbar / s > 0 at every k", result, bool(np.all(above > 0)))
-    assumptions = structure, greedy, *_positive(c), condition
-    if not condition.met:
-        return Bound("Theorem 3, lower", "(34)", assumptions, None, None)
-    values = _recursion(c["p0_lower"], c["tau_lower"] * above / below, left * c["w_lower"])
-    return _below("Theorem 3, lower", "(34)", assumptions, values, relays)
-
-
-def _receiver_lower(c: dict[str, float], upper: np.ndarray, receiver: np.ndarray, greedy: Assumption) -> Bound:
-    """p_k = alpha_(k-1) p_(k-1) + w, alpha = tau o / (o + 4 mu^2 f mbar)."""
-    structure = _structure(c)
-    if not structure.met:
-        return Bound("Theorem 4, lower", "(52)", (structure, greedy), None, None)
-    alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * c["mu_upper"] ** 2 * c["f_upper"] * upper[:-1])
-    values = _recursion(c["p0_lower"], alpha, c["w_lower"])
-    return _below("Theorem 4, lower", "(52)", (structure, greedy, *_positive(c)), values, receiver)
+        return [_bound(name, source, (structure, greedy), None, errors) for name, source, errors in names]
+    lower = _lower(c, upper[:-1])
+    result = f"{lower.above[0]:.4g} at k = 1 (printed form {lower.printed[0]:.4g}), least {lower.above.min():.4g}"
+    condition = Assumption("n - c mbar / s > 0 at every k", result, bool(np.all(lower.above > 0)))
+    relay = _recursion(c["p0_lower"], lower.rho, lower.left * c["w_lower"]) if condition.met else None
+    remote = _recursion(c["p0_lower"], lower.alpha, c["w_lower"])
+    needs = structure, greedy, *_positive(c)
+    assumed = ((*needs, condition), relay), (needs, remote)
+    return [_bound(name, source, *part, errors) for (name, source, errors), part in zip(names, assumed, strict=True)]
 
 
 def _uniform(
@@ -249,23 +249,16 @@ def _uniform(
     """Bounds for all time, which need tau < 1: max(p0, w / (1 - tau)) and min(p0, w / (1 - alpha))."""
     tau, structure = c["tau_upper"], _structure(c)
     contracting = Assumption("largest eigenvalue of A A' below 1", f"{tau:.6g}", tau < 1)
-    names = ("Lemma 8, upper", relays), ("Lemma 9, upper", receiver)
-    lower_names = ("Lemma 8, lower", relays), ("Lemma 9, lower", receiver)
-    needs = contracting, greedy, structure
+    needs, errors = (contracting, greedy, structure), {"Lemma 8": relays, "Lemma 9": receiver}
     if not contracting.met or not structure.met:
-        return [Bound(name, "(49) and (64)", needs, None, None) for name, _ in (*names, *lower_names)]
-    top = max(c["p0_upper"], c["w_upper"] / (1 - tau))
-    (above,), (below,), _, left = _lower_condition(c, np.array([top]))
-    rho = c["tau_lower"] * above / below
-    alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * c["mu_upper"] ** 2 * c["f_upper"] * top)
-    condition = Assumption("n - c mbar / s > 0", f"{above:.4g}", bool(above > 0))
-    low = {
-        "Lemma 8, lower": (min(c["p0_lower"], left * c["w_lower"] / (1 - rho)), (condition,)),
-        "Lemma 9, lower": (min(c["p0_lower"], c["w_lower"] / (1 - alpha)), ()),
-    }
-    result = [_above(name, "(49)", needs, np.full(horizon + 1, top), eigenvalues) for name, eigenvalues in names]
-    for name, eigenvalues in lower_names:
-        value, extra = low[name]
+        names = [(f"{lemma}, {side}", e) for side in ("upper", "lower") for lemma, e in errors.items()]
+        return [_bound(name, "(49) and (64)", needs, None, e) for name, e in names]
+    top, every = max(c["p0_upper"], c["w_upper"] / (1 - tau)), np.ones(horizon + 1)
+    lower = _lower(c, np.array([top]))
+    condition = Assumption("n - c mbar / s > 0", f"{lower.above[0]:.4g}", bool(lower.above[0] > 0))
+    lowest = lower.left * c["w_lower"] / (1 - lower.rho[0]), c["w_lower"] / (1 - lower.alpha[0])
+    result = [_bound(f"{lemma}, upper", "(49)", needs, top * every, e) for lemma, e in errors.items()]
+    for (lemma, e), low, extra in zip(errors.items(), lowest, ((condition,), ()), strict=True):
         assumptions = *needs, *_positive(c), *extra
-        result.append(_below(name, "(49) and (64)", assumptions, np.full(horizon + 1, value), eigenvalues))
+        result.append(_bound(f"{lemma}, lower", "(49) and (64)", assumptions, min(c["p0_lower"], low) * every, e))
     return result

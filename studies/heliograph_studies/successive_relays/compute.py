@@ -8,13 +8,101 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.files.recording import write_estimates
+from heliograph.numerics.check import fail
 from heliograph.relays import RelayDesign
 from heliograph.relays.design import GainsByFilter
-from heliograph_studies.outcome import Unlisted
-from heliograph_studies.stages import Stages
+from heliograph_studies import Stages, Unlisted
 from heliograph_studies.successive_relays.certificate import RelayCertificate, certify_relays
-from heliograph_studies.successive_relays.printed import MISPRINTS, Recursion, by_filter, recursion
+from heliograph_studies.successive_relays.misprints import alternating
 from heliograph_studies.successive_relays.setting import QUIET_START, Setting, shadowing
+
+MISPRINTS = ("none", "lemma_1", "theorem_1", "lemma_7", "lemma_6_sign", "lemma_6_last")
+
+
+class Recursion(NamedTuple):
+    """Gains of the receiving relay and of the remote filter, (N, n, 1), and traces claimed for k = 0 .. N."""
+
+    relay_gain: np.ndarray
+    remote_gain: np.ndarray
+    relay_trace: np.ndarray  # (N + 1, 2)
+    remote_trace: np.ndarray  # (N + 1,)
+
+
+def recursion(misprint: str, horizon: int, setting: Setting) -> Recursion:
+    """Lemmas 1 to 7 and Theorems 1 and 2 on the example.
+
+    Misprints: lemma_1, Pi from V in (13); theorem_1, Xi_i for Xi_ij in the gain (30); lemma_7, the variance squared for
+    the mean squared before P_i + P_i'; lemma_6_sign, delta for deltabar in (24); lemma_6_last, Xi_i' for Xi_ij' there.
+
+    Raises:
+        ValueError: an unknown misprint.
+    Source: (13), (14), (18), (21), (24), (26), (29), (31).
+    """
+    if misprint not in MISPRINTS:
+        raise fail("misprint", f"one of {list(MISPRINTS)}", repr(misprint))
+    Gam, Psi, n = setting.transition, np.array([setting.sensing]), len(setting.transition)
+    SS = np.outer(setting.process_input, setting.process_input)
+    Q, R = setting.process * SS, setting.sensor_input**2 * setting.sensor_noise * np.eye(1)
+    Q1 = setting.sensor_noise * SS if misprint == "lemma_1" else Q
+    G = setting.noise * np.eye(1)  # and O
+    P = C = setting.initial_covariance
+    X, Xx, Pm = ([P, P] for _ in range(3))
+    Pi = P + np.outer(setting.initial_mean, setting.initial_mean)
+    K_all, L_all, relay, remote = [], [], [[np.trace(P)] * 2], [np.trace(P)]
+    v, m_3 = setting.spread, setting.means[2]
+    for k in range(1, horizon + 1):
+        # The relay that receives: the covariance of its innovation, and its gain (30).
+        i, j = (0, 1) if k % 2 == 0 else (1, 0)
+        m, d = setting.means[i], setting.means[3 + j]
+        Cij = C if i == 0 else C.T
+        Gb = m * Psi @ Gam + m_3 * Psi
+        al = (v + m**2) * (Psi @ Q @ Psi.T + R) + G + v * Psi @ (Pi + Gam @ Pi @ Gam.T) @ Psi.T
+        al = al + (v + m_3**2) * Psi @ X[j] @ Psi.T - v * Psi @ _twice(Xx[j]) @ Psi.T
+        al = al - _twice(m_3 * Gb @ Cij @ Psi.T)
+        wrong = X[i] if misprint == "theorem_1" else Cij
+        K = (Gam @ (X[i] @ Gb.T - m_3 * wrong @ Psi.T) + m * Q @ Psi.T) @ np.linalg.inv(Gb @ X[i] @ Gb.T + al)
+        # The remote filter: the same, and its gain (31).
+        square = v**2 if misprint == "lemma_7" else d**2
+        Re = v * Pi - square * _twice(Pm[j]) + (v + d**2) * X[j] - v * _twice(Xx[j])
+        Ok = d**2 * Psi @ P @ Psi.T + Psi @ Re @ Psi.T + G
+        L = d * Gam @ (P - Pm[j]) @ Psi.T @ np.linalg.inv(Ok)
+        # Covariances of all errors, and of errors with the state, at k.
+        A, B, KP, LP = Gam - K @ Gb, Gam - d * L @ Psi, K @ Psi, L @ Psi
+        P_next = B @ P @ B.T + LP @ Re @ LP.T + _twice(d * Gam @ Pm[j] @ LP.T) + Q + L @ G @ L.T
+        first = Gam - LP if misprint == "lemma_6_sign" else B  # delta_i + delta_j = 1 for its mean d
+        last = X[i] if misprint == "lemma_6_last" else Cij.T
+        Pi_next = first @ Pm[i] @ A.T + m_3 * B @ Pm[j] @ KP.T + m_3 * d * LP @ X[j] @ KP.T
+        Pm_i = Pi_next + Q @ (np.eye(n) - m * KP.T) + d * LP @ last @ A.T
+        Pm_j = B @ Pm[j] @ Gam.T + Q + d * LP @ X[j] @ Gam.T
+        X_i = A @ X[i] @ A.T + _twice(m_3 * Gam @ Cij @ KP.T - m * KP @ Q) + Q + K @ al @ K.T
+        C_next = A @ Cij @ Gam.T + m_3 * KP @ X[j] @ Gam.T - m * KP @ Q + Q
+        Xx_i = Gam @ Xx[i] @ A.T + m_3 * Gam @ Xx[j] @ KP.T - m * Q @ KP.T + Q
+        X_j, Xx_j = Gam @ X[j] @ Gam.T + Q, Gam @ Xx[j] @ Gam.T + Q
+        X, Xx, Pm = (list(pair) if i == 0 else list(pair[::-1]) for pair in ((X_i, X_j), (Xx_i, Xx_j), (Pm_i, Pm_j)))
+        C, P, Pi = (C_next if i == 0 else C_next.T), P_next, Gam @ Pi @ Gam.T + Q1
+        K_all.append(K)
+        L_all.append(L)
+        relay.append([np.trace(x) for x in X])
+        remote.append(np.trace(P))
+    return Recursion(np.array(K_all), np.array(L_all), np.array(relay), np.array(remote))
+
+
+def by_filter(result: Recursion) -> dict[str, np.ndarray]:
+    """The gains as the library takes them: relay 2 listens at odd k, relay 1 at even k."""
+    odd = (np.arange(1, len(result.relay_gain) + 1) % 2 == 1)[:, None, None]
+    zero = np.zeros_like(result.relay_gain)
+    return {
+        "relay_1": np.where(odd, zero, result.relay_gain),
+        "relay_2": np.where(odd, result.relay_gain, zero),
+        "receiver": result.remote_gain,
+    }
+
+
+def _twice(a: np.ndarray) -> np.ndarray:
+    """a + a'."""
+    result: np.ndarray = a + a.T
+    return result
+
 
 NAMES = {"relay_1": "relay_1", "relay_2": "relay_2", "receiver": "remote"}
 STEADY = ("paper", "joint", "lmmse", "lmmse_tuned", "no_relay")  # of which the summary tells
@@ -125,12 +213,8 @@ def steady(setting: Setting) -> dict[str, Steady]:
     """The two-periodic steady state of each design."""
     network = setting.network()
     paper = hg.relays.periodic_local_error_design(network)
-    listen = {"relay_1": 1, "relay_2": 0}  # slots: odd, even
-    start = {name: np.zeros((2, 3, 1)) for name in listen}
-    for name, slot in listen.items():
-        start[name][slot, :, 0] = QUIET_START[name]
     limited = paper.total_power()
-    tuned = [hg.relays.periodic_relays_for_best_receiver(network, s) for s in (None, start)]
+    tuned = [hg.relays.periodic_relays_for_best_receiver(network, s) for s in (None, QUIET_START)]
     quiet = hg.relays.periodic_relays_for_best_receiver(network, tuned[1], power_limit=limited)
     relays = {"lmmse": paper.gains, "lmmse_tuned": min(tuned, key=lambda g: _behind(network, g).even
               + _behind(network, g).odd), "lmmse_tuned_from_paper": tuned[0], "lmmse_quiet": quiet}  # fmt: skip
@@ -222,13 +306,7 @@ def simulate(setting: Setting, design: RelayDesign, stages: Stages) -> Simulated
 def counterexample() -> RelayCertificate:
     """A scalar system that is bounded as Lemmas 8 and 9 ask, and obeys none of their printed lower bounds."""
     plant = hg.LinearPlant([[0.5]], [[1.0]], [0.0], [[10.0]])
-    law = shadowing(0.5, 0.1)
-    noisy, quiet = hg.hop(law, 1e6), hg.hop(law, 0.0)
-    slots = [
-        {"relay_2": {"sensor": noisy, "relay_1": quiet}, "receiver": {"relay_1": noisy}},
-        {"relay_1": {"sensor": noisy, "relay_2": quiet}, "receiver": {"relay_2": noisy}},
-    ]
-    network = hg.model.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
+    network = alternating(plant, hg.LinearSensor([[1.0]], [[1.0]]), shadowing(0.5, 0.1), 1e6, 1e6)
     return certify_relays(network, hg.relays.local_error_design(network, 60).gains)
 
 

@@ -163,9 +163,8 @@ def density(drive: Drive, late: float, place: np.ndarray, covariance: np.ndarray
     """Mean log density of the true places within the window, the stamps' lateness before each slot."""
     time = slots(drive).time
     used = np.flatnonzero((time >= drive.window[0]) & (time <= drive.window[1]))
-    e, p = true_places(drive, time[used] - late) - place[used], covariance[used]
-    squared = np.einsum("ti,tij,tj->t", e, np.linalg.inv(p), e)
-    return float(np.mean(-(squared + np.log(np.linalg.det(p))) / 2 - np.log(2 * np.pi)))
+    squared = hg.nees(true_places(drive, time[used] - late), place[used], covariance[used])
+    return float(np.mean(-(squared + np.log(np.linalg.det(covariance[used]))) / 2 - np.log(2 * np.pi)))
 
 
 def learn(rule: str, drives: Sequence[Drive], iterations: int, progress: Callable[[], None] = lambda: None) -> Numbers:

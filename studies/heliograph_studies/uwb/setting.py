@@ -9,8 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.model.plant import AbstractPlant
-from heliograph.numerics.check import check_count
-from heliograph_studies.settings import NO_FILE, File
+from heliograph_studies import NO_FILE, File, check_fields
 
 HEIGHT = 1.0  # m, of the tag: the drives are flat
 SIZES = 1.3 ** np.arange(-2.0, 3.0)
@@ -83,7 +82,7 @@ class Setting:
     iterations: int = 6
 
     def __post_init__(self) -> None:
-        check_count("iterations", self.iterations, 0)
+        check_fields(self, iterations=0)
         object.__setattr__(self, "recording", File(self.recording))
 
 
@@ -117,6 +116,7 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
     """The extended filter of a rule, with these numbers, from a place; its input is the time since the step before."""
     count = len(anchors)
 
+    # A walk of the speed in the plane.
     def move(x: jax.Array, u: jax.Array) -> jax.Array:
         return jnp.concatenate([x[:2] + u[0] * x[2:], x[2:]])
 
@@ -135,6 +135,7 @@ def filter_of(rule: str, numbers: Numbers, anchors: Any, start: Any) -> hg.filte
         inputs=("dt",),
     )
 
+    # Ranges to the anchors, and errors with memory as states.
     def ranges(x: jax.Array) -> jax.Array:
         across = jnp.sqrt((x[0] - anchors[:, 0]) ** 2 + (x[1] - anchors[:, 1]) ** 2 + (HEIGHT - anchors[:, 2]) ** 2)
         result: jax.Array = across + numbers.excess

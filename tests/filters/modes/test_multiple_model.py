@@ -223,7 +223,7 @@ def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
 
 
-def test_a_mode_that_losses_reveal_is_known():
+def test_a_mode_that_losses_show_is_known():
     """Everything lost in one mode, nothing in the other: the Kalman filter that skips, whatever the chain."""
     links = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.erasure(hg.hop(0.8, 0.1), 0.0), 0.2, 0.4)
     data = [0.3, np.nan, np.nan, 0.8, -0.2]

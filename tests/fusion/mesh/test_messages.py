@@ -9,14 +9,15 @@ from tests.fusion.mesh.worlds import NODES, PLANT, RING, models, network, sender
 
 LEVELS, AMPLITUDE, STEPS, RUNS = 401, 60.0, 20, 300
 LATE = hg.erasure(hg.model.delayed(hg.perfect(), hg.Discrete([0, 1, 2], [0.5, 0.3, 0.2]), timestamped=True), 0.8)
-ROUNDED = UniformQuantizer(LEVELS, AMPLITUDE)
+ROUNDED, TIGHT = UniformQuantizer(LEVELS, AMPLITUDE), UniformQuantizer(21, 3.0)
+QUANTIZERS = {"quantized": ROUNDED, "both": ROUNDED, "tight": TIGHT, "tight and late": TIGHT}
 
 
 def late_and_quantized():
-    """The ring of four nodes with links that lose and delay, quantizers, and both."""
-    parts = {"late": {"link": LATE}, "quantized": {"quantizer": ROUNDED}, "both": {"link": LATE, "quantizer": ROUNDED}}
-    rule = EqualIntersection()
-    fused = {name: hg.Fusion("own", rule, neighbours=RING, **part) for name, part in parts.items()}  # type: ignore[arg-type]
+    """The ring of four nodes with links that lose and delay, quantizers, of which two saturate often, and both."""
+    links, rule = {"late": LATE, "both": LATE, "tight and late": LATE}, EqualIntersection()
+    fused = {name: hg.Fusion("own", rule, QUANTIZERS.get(name), neighbours=RING, link=links.get(name))
+             for name in ("late", *QUANTIZERS)}  # fmt: skip
     return hg.Network(PLANT, network({}).nodes, fused)
 
 
@@ -25,8 +26,12 @@ def record():
     return hg.monte_carlo(late_and_quantized(), horizon=STEPS, runs=RUNS, key=5)
 
 
-def by_hand(z, ages, quantized):
-    """Means (time, node, n) and covariances of one run; `ages(k, i, j)` of what j sent to i, None: nothing."""
+def by_hand(z, ages, quantizer):
+    """Means (time, node, n) and covariances of one run; `ages(k, i, j)` of what j sent to i, None: nothing.
+
+    And how many of the means that would arrive were beyond the quantizer's amplitude.
+    """
+    beyond = 0
     a, q, p, h, r = models()
     means, covariances = [np.tile([1.0, -2.0], (4, 1))], [np.tile(p, (4, 1, 1))]
     for k in range(STEPS):
@@ -40,9 +45,12 @@ def by_hand(z, ages, quantized):
                 fresh += [j] if age == 0 else []
                 # What j sent `age` steps ago, corrected by the measurement sent with it and predicted to now.
                 x, c = means[k - age][j], covariances[k - age][j]
-                if quantized:
-                    width = 2 * AMPLITUDE / LEVELS
-                    x, t = (np.floor((x + AMPLITUDE) / width) + 0.5) * width - AMPLITUDE, width / np.sqrt(np.trace(c))
+                if quantizer is not None:
+                    amplitude, width = quantizer.amplitude, 2 * quantizer.amplitude / quantizer.levels
+                    if np.abs(x).max() > amplitude:
+                        beyond += 1
+                        continue
+                    x, t = (np.floor((x + amplitude) / width) + 0.5) * width - amplitude, width / np.sqrt(np.trace(c))
                     c = (1 + t) * c + (1 + 1 / t) * width * np.eye(2) * width / 2
                 for late in range(age):
                     x, c = a @ x, a @ c @ a.T + q
@@ -60,28 +68,54 @@ def by_hand(z, ages, quantized):
         x, c = (np.array(part) for part in zip(*after, strict=True))
         means.append(x)
         covariances.append(c)
-    return np.array(means[1:]), np.array(covariances[1:])
+    return np.array(means[1:]), np.array(covariances[1:]), beyond
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["late", "quantized", "both"])
-def test_a_run_is_that_by_hand_and_no_error_is_above_its_claim(record, name):
+@pytest.mark.parametrize("name", ["late", *QUANTIZERS])
+def test_a_run_is_that_by_hand_and_no_error_is_above_what_nothing_saturated_claims(record, name):
     reports, z = record.reports[name], {node: np.asarray(record.measurements[node][0]) for node in NODES}
+    quantizer = QUANTIZERS.get(name)
 
     def ages(k, i, j):
         value = reports[NODES[i]].values[0, k, RING[NODES[i]].index(NODES[j])]
-        return None if np.isnan(value) else int(value) * (name != "quantized")
+        return None if np.isnan(value) else int(value) * ("quantized" != name != "tight")
 
-    means, covariances = by_hand(z, ages, name != "late")
+    means, covariances, beyond = by_hand(z, ages, quantizer)
+    assert (beyond > 20) == (quantizer is TIGHT)
     for i, node in enumerate(NODES):
         estimate = record.estimates[node][name]
-        assert estimate.claim == "upper"
+        assert estimate.claim == ("upper" if quantizer is None else "nominal")
         np.testing.assert_allclose(estimate.mean[0], means[:, i], rtol=0, atol=1e-9)
         np.testing.assert_allclose(estimate.covariance[0], covariances[:, i], rtol=1e-9)
+        assert np.isfinite(estimate.covariance).all()
+        if quantizer is TIGHT:
+            continue
         # The mean over 300 runs of what has at most a chi-square's mean: 5 deviations of it are 1 + 5 sqrt(1 / 300).
         error, covariance = record.errors(node, name), np.asarray(estimate.covariance)
         nees = np.einsum("rta,rta->rt", error, np.linalg.solve(covariance, error[..., None])[..., 0]) / 2
         assert nees.mean(axis=0).max() < 1 + 5 / np.sqrt(RUNS) and nees.mean() < 1.03
+
+
+@pytest.mark.slow
+def test_where_a_quantizer_saturates_the_error_is_above_the_claim_which_is_nominal():
+    """x stays what it is, a measures it, b has it from a, and c from b alone, unless |x| > 1: E[x^2 | |x| > 1] = 2.525.
+
+    What c claims without b's estimates, E[x^2] = 1, is true in the mean over all runs and too little where c needs it.
+    """
+    plant, runs = hg.LinearPlant([[1.0]], [[1e-6]], [0.0], [[1.0]]), 4000
+    sensor = hg.LinearSensor([[1.0]], 1e-3)
+    nodes = {"a": hg.Node(sensor, hg.perfect(), {"own": hg.kalman_filter(plant, sensor)}), "b": None, "c": None}
+    near = {"b": ["a"], "c": ["b"]}
+    item = hg.Fusion("own", EqualIntersection(), UniformQuantizer(1001, 1.0), neighbours=near)
+    record = hg.monte_carlo(hg.Network(plant, nodes, {"m": item}), horizon=6, runs=runs, key=1)
+    error, variance = record.errors("c", "m")[:, -1, 0], np.asarray(record.estimates["c"]["m"].covariance)[:, -1, 0, 0]
+    alone = variance > 0.9
+    assert record.estimates["c"]["m"].claim == "nominal"
+    # Of a normal x, |x| > 1 has the probability .3173; four deviations of a share and of a mean over so many runs.
+    assert alone.mean() == pytest.approx(0.3173, abs=4 * np.sqrt(0.22 / runs))
+    assert np.mean(error[alone] ** 2) == pytest.approx(2.525, abs=4 * 1.6 / np.sqrt(0.3 * runs))
+    assert np.mean(error**2) > 2 * np.mean(variance)
 
 
 @pytest.mark.slow

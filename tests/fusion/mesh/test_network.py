@@ -153,6 +153,19 @@ BAD = {
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(hg.fusion.DiffusionWeights(STRANGER))}),
         "diffusion shares of 'a': expected those of its neighbours",
     ),
+    "a stranger's shares": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()}, {"m": fusion(hg.fusion.DiffusionWeights({"c": {"a": 1.0}}))}
+        ),
+        "diffusion shares: expected those of nodes of the fusion",
+    ),
+    "losses that nobody knows of on one edge": (
+        lambda: hg.Network(
+            PLANT, {"a": node(), "b": node()},
+            {"m": fusion(neighbours={"a": [], "b": ["a"]}, link={"a to b": hg.dropout(hg.perfect(), 0.8)})}
+        ),
+        "link 'a to b': expected messages that arrive as they are",
+    ),
     "losses that nobody knows of": (
         lambda: hg.Network(PLANT, {"a": node(), "b": node()}, {"m": fusion(link=hg.dropout(hg.perfect(), 0.8))}),
         "link between neighbours: expected messages that arrive as they are",
@@ -191,7 +204,7 @@ BAD = {
             PLANT, hg.LinearSensor(np.eye(2), [[1.0, 0.3], [0.3, 1.0]]), hg.perfect(2),
             {name: {"own": hg.kalman_filter(PLANT, sensor())} for name in "ab"}, {"m": fusion()}
         ),
-        "whose noises are uncorrelated, got nodes that share a channel: stack their measurements",
+        "whose noises are uncorrelated, got ['a', 'b'], which share a channel: stack their measurements",
     ),
     "a measurement without noise": (
         lambda: hg.Network(PLANT, {"a": node(0.0), "b": node()}, {"m": fusion(neighbours={"a": ["b"], "b": ["a"]})}),
@@ -288,6 +301,24 @@ def test_bursts_that_outlast_a_mode_are_refused(stays, refused):
             network({"m": RULES["trace"]}, {"b": ["a"]}, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
     else:
         assert network({"m": RULES["trace"]}, {"b": ["a"]}, link, plant=plant, rows={"a": ([[1.0]], 0.3)}).meshes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [0.4, 0.6])
+def test_fixed_shares_are_refused_where_errors_grow_as_those_before_data_do(loss, monkeypatch):
+    plant, near = hg.LinearPlant([[1.2]], [[0.1]], [0.0], [[1.0]]), {"b": ["a"], "c": ["b"]}
+    link = hg.erasure(hg.perfect(), 1 - loss)
+    with monkeypatch.context() as unrefused:
+        unrefused.setattr("heliograph.simulation.centres.mesh_check.check_decay", lambda *_: None)
+        net = network({"m": RULES["diffusion"]}, near, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
+    error = hg.simulation.mean_mesh_errors(net, "m", 240).mean_trace()
+    growth = (error[-1] / error[-101]) ** 0.01
+    if loss == 0.4:
+        assert growth == pytest.approx(1.0, abs=1e-9)
+        network({"m": RULES["diffusion"]}, near, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
+        return
+    with pytest.raises(ValueError, match=f"squares that grow by {growth:.3g} a step at node 'c'"):
+        network({"m": RULES["diffusion"]}, near, link, plant=plant, rows={"a": ([[1.0]], 0.3)})
 
 
 def test_a_decaying_mode_that_nobody_observes_stays_with_a_warning():

@@ -140,7 +140,7 @@ def test_nothing_that_varies_is_no_evidence():
     assert (result.likelihood_p, result.runs_p) == (1.0, 1.0)
 
 
-def test_the_law_that_foretells_best_is_chosen(learned):
+def test_the_law_that_predicts_best_is_chosen(learned):
     said = {name: item.gain for name, item in learned.held_out.items()}
     assert learned.best == "hidden"
     assert said["independent"] == 0 < said["markov"] < said["markov_4"] < said["hidden"]

@@ -97,6 +97,13 @@ class Skips(Memory):
         return reader
 
 
+class Repeats(Memory):
+    """The same comes again and again, at once, and nothing else."""
+
+    def batch(self, read: int) -> list[bytes]:
+        return [b"{}"]
+
+
 class TellsLater(Memory):
     """`publish` returns before anything is out, and then the process ends."""
 
@@ -156,6 +163,7 @@ def test_another_order_of_what_comes_again_is_allowed_and_informed():
         (Shuffles, "receive: expected new messages in order"),
         (Cuts, "receive: expected 1 messages within 1 s, 1 did not come"),
         (Skips, "receive: expected .* did not come"),
+        (Repeats, "receive: expected 1 messages within 1 s, 1 did not come"),
         (TellsLater, "publish: expected 100 outputs at the broker, 100 are not"),
         (TellsBackwards, "publish: expected the outputs in order"),
         (Ends, "receive: .* got None"),

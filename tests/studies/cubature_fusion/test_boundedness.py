@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph_studies.cubature_fusion.boundedness import growth_condition
+from heliograph_studies.cubature_fusion.one_step import growth_condition
 from tests.machine import PRINTED, plant
 from tests.oracles.relayed_machine import jacobian
 

@@ -14,7 +14,8 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import cubature_fusion
-from heliograph_studies.cubature_fusion import compute, one_step
+from heliograph_studies.cubature_fusion import compute, one_step, statements
+from heliograph_studies.cubature_fusion.compute import MixedCross, variants
 from heliograph_studies.cubature_fusion.setting import (
     NODES,
     PRINTED,
@@ -26,8 +27,6 @@ from heliograph_studies.cubature_fusion.setting import (
     plant,
     sensor,
 )  # fmt: skip
-from heliograph_studies.cubature_fusion.statements import statements
-from heliograph_studies.cubature_fusion.variants import MixedCross, variants
 from heliograph_studies.statement import Sampled
 from tests import machine
 from tests.oracles import cubature_fusion as oracle

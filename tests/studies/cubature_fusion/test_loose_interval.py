@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph_studies.cubature_fusion.loose_interval import LooseInterval
+from heliograph_studies.cubature_fusion.setting import LooseInterval
 from tests.filters.gaussian.test_gaussian import SETTINGS
 from tests.filters.test_bounds import (
     FIXED,

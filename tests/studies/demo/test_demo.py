@@ -15,9 +15,18 @@ from heliograph_studies import demo
 from heliograph_studies.demo import compute as compute_module
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import NAMES, Design, Outcome, average_noise, channel_less, relay
-from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, first_half, learn, relayed, single
+from heliograph_studies.demo.learned import (
+    FIRST_GUESS,
+    HELD,
+    Learned,
+    direct,
+    first_half,
+    learn,
+    relayed,
+    score,
+    single,
+)
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
-from heliograph_studies.demo.scores import score
 from heliograph_studies.markdown import filled
 from heliograph_studies.stages import Stages
 from heliograph_studies.study import no_progress
@@ -146,7 +155,7 @@ def test_constants_of_one_drive_serve_another(outcome: Outcome, learned: Learned
     assert (other.recording, other.rows, outcome.recording) == ("Plaza1", 9660, "Plaza2")
     text = filled(
         Path(demo.__file__).with_name("page.md"),
-        {"setting": demo.Setting("plaza1"), **vars(other), **demo.example.words(other)},
+        demo.example.numbers(demo.Setting("plaza1"), other),
     )
     assert "The constants come from another drive" in text and "in-sample" not in text
     assert "--recording plaza1" in text and "demo.robot:plaza1" in text

@@ -3,8 +3,13 @@ import pytest
 
 from heliograph_studies.demo import recording as recording_module
 from heliograph_studies.demo import robot
-from heliograph_studies.demo.calibration import WINDOW, calibrate, calibrate_odometry, calibrate_ranges
-from heliograph_studies.demo.recording import PlazaRecording, find_recording, read_recording
+from heliograph_studies.demo.recording import (
+    PlazaRecording,
+    find_recording,
+    read_recording,
+)
+from heliograph_studies.demo.robot import WINDOW
+from tests.studies.demo.calibration import calibrate, calibrate_odometry, calibrate_ranges
 
 PLAZA2 = robot.DRIVES["plaza2"]
 

@@ -8,14 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.h_infinity import growth_check
 from heliograph_studies import h_infinity_fusion
-from heliograph_studies.h_infinity_fusion import (
-    discriminating,
-    example,
-    levels,
-    one_step,
-    structured,
-    worst_disturbance,
-)
+from heliograph_studies.h_infinity_fusion import discriminating, example, levels, worst_disturbance
 from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
 
 pytestmark = pytest.mark.slow
@@ -30,11 +23,11 @@ def test_with_the_papers_start_only_the_start_counts():
 
 
 def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(monkeypatch):
-    assert all(one_step.enumeration_gap(SETTING, i) < 1e-14 for i in range(4))  # rounding
-    honest = one_step.theorem_matrix
+    assert all(levels.enumeration_gap(SETTING, i) < 1e-14 for i in range(4))  # rounding
+    honest = levels.theorem_matrix
     off = SETTING.system(1, hop=lambda uplink, noise: SETTING.lossy(uplink, noise if uplink else 1.01 * noise))
-    monkeypatch.setattr(one_step, "theorem_matrix", lambda system, *rest: honest(off, *rest))
-    assert one_step.enumeration_gap(SETTING, 1) > 1e-6  # one noise's variance 1 % too large
+    monkeypatch.setattr(levels, "theorem_matrix", lambda system, *rest: honest(off, *rest))
+    assert levels.enumeration_gap(SETTING, 1) > 1e-6  # one noise's variance 1 % too large
 
 
 def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeypatch):
@@ -57,8 +50,8 @@ def test_fused_levels():
 
 def test_the_search_finds_the_norm_of_a_linear_system():
     """With phi = 0 and no gain, the largest ratio is a singular value."""
-    rotation, steps = structured.ROTATION, structured.STEPS
-    nothing = hg.h_infinity.GrowthSystem(*structured.system("1"))
+    rotation, steps = discriminating.ROTATION, discriminating.STEPS
+    nothing = hg.h_infinity.GrowthSystem(*discriminating.system("1"))
     design = hg.h_infinity.HInfinityDesign(
         1.0, np.zeros((steps, 2, 2)), np.zeros((steps + 1, 4, 4)), np.zeros((steps, 2)), True, ""
     )
@@ -66,17 +59,18 @@ def test_the_search_finds_the_norm_of_a_linear_system():
     def transition(x, u):
         return jnp.where(u[1] > 0, rotation @ x, x)
 
-    plant = hg.Plant(transition, np.zeros((2, 2)), np.zeros(2), np.eye(2), inputs=structured.INPUTS)
-    item = hg.filters.h_infinity_filter(plant, structured.sensor("1"), nothing, design)
+    plant = hg.Plant(transition, np.zeros((2, 2)), np.zeros(2), np.eye(2), inputs=discriminating.INPUTS)
+    item = hg.filters.h_infinity_filter(plant, discriminating.sensor("1"), nothing, design)
     world = worst_disturbance.World(
-        lambda x, k: rotation @ x, lambda x: x[:1], structured.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
-        structured.inputs("bias"),
+        lambda x, k: rotation @ x, lambda x: x[:1], discriminating.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
+        discriminating.inputs("bias"),
     )  # fmt: skip
-    draws = structured.draws(2, 0)
+    draws = discriminating.LINKS.draws(2, 0)
     result = worst_disturbance.worst_disturbance(item, world, draws, draws, [1.0], rounds=200)
     powers = [np.linalg.matrix_power(rotation, k) for k in range(steps)]
+    push = discriminating.DISTURBANCE
     toeplitz = np.block([
-        [powers[k], *(powers[k - 1 - j] @ structured.DISTURBANCE if j < k else np.zeros((2, 1)) for j in range(steps))]
+        [powers[k], *(powers[k - 1 - j] @ push if j < k else np.zeros((2, 1)) for j in range(steps))]
         for k in range(steps)
     ])  # fmt: skip
     top = np.linalg.svd(toeplitz, compute_uv=False)[0]
@@ -86,10 +80,10 @@ def test_the_search_finds_the_norm_of_a_linear_system():
 
 
 def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_should():
-    system = structured.system("1")
+    system = discriminating.system("1")
     design = hg.h_infinity.horizon_design(system, separate=True)
-    side = np.full(2, structured.BOX)
-    finding = hg.h_infinity.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
+    side = np.full(2, discriminating.BOX)
+    finding = hg.h_infinity.check_growth(discriminating.slight, discriminating.GROWTH, -side, side, "phi")
     assert not finding.refuted and levels.certify(system, design, [finding]).certified
     assert design.level == pytest.approx(7.2565, rel=1e-4)  # of which margins in a large system's units cost 1.7e-4
     with pytest.MonkeyPatch.context() as patch:
@@ -99,12 +93,12 @@ def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_shou
         patch.setattr(discriminating, "JUDGE_DRAWS", 1_000)
         worst = discriminating.worst_cases({})["ekf"]
     assert worst.level - 4 * worst.standard_error > design.level
-    assert hg.h_infinity.horizon_design(structured.system("1", False), separate=True).level > 4 * design.level
+    assert hg.h_infinity.horizon_design(discriminating.system("1", False), separate=True).level > 4 * design.level
 
 
 def kalman(node):
-    believed, sensor = structured.plant(False), structured.sensor(node)
-    return example.prediction_of(hg.extended_filter(believed, sensor, structured.channel()))
+    believed, sensor = discriminating.plant(False), discriminating.sensor(node)
+    return example.prediction_of(hg.extended_filter(believed, sensor, discriminating.LINKS.unit_channel()))
 
 
 @pytest.mark.parametrize("runs", [0, 99, 100.5])

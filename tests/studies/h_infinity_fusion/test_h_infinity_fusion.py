@@ -12,20 +12,9 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies import h_infinity_fusion
-from heliograph_studies.h_infinity_fusion import (
-    compute,
-    discriminating,
-    example,
-    growth,
-    indices,
-    levels,
-    numbers,
-    structured,
-    worst_disturbance,
-)
-from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion import compute, discriminating, example, levels, statements, worst_disturbance
+from heliograph_studies.h_infinity_fusion.compute import Parts
 from heliograph_studies.h_infinity_fusion.setting import NODES, Setting, dynamics
-from heliograph_studies.h_infinity_fusion.statements import statements
 from tests.studies.h_infinity_fusion.verdicts import VERDICTS
 from tests.studies.readme import said_of
 from tests.studies.verdicts import check_verdicts
@@ -90,7 +79,7 @@ def nodes():
 
 def test_every_certificate_passes_theorem_1_as_printed(nodes):
     for i, node in enumerate(nodes):
-        entries = numbers.certificate(node)
+        entries = compute.certificate(node)
         assert len(entries) == 16 and node.certificate.steps_certified == 16
         np.testing.assert_array_equal(entries[0]["P"], 10 * np.eye(4))
         assert np.linalg.eigvalsh(entries[0]["gamma"] ** 2 * 15 * np.eye(4) - entries[0]["P"])[0] > 0  # (19)
@@ -170,13 +159,13 @@ def test_errors_saturation_and_indices(outcome):
     assert mean == pytest.approx(0.0354, abs=5.1e-5) and error < 1e-15  # nothing is random without measurements
     uplink = outcome.record.uplinks[example.fused_name(RECURSIVE, "dynamic")]
     assert uplink.saturated.mean() == pytest.approx(0.262, abs=0.01)  # 128 runs; the printed digits of the mean
-    replayed = indices.replay(outcome)
+    replayed = example.replay(outcome)
     np.testing.assert_array_equal(np.abs(outcome.estimates(RECURSIVE)) > replayed.amplitude,
                                   np.swapaxes(uplink.saturated, 1, 2))  # fmt: skip
-    answer = indices.indices(outcome, replayed)
+    answer = example.indices(outcome, replayed)
     np.testing.assert_allclose(answer.local[RECURSIVE], [-310.5, -273.5, -309.5, -351.3], atol=0.051)
     assert answer.fused[RECURSIVE] == pytest.approx(-2470.2, abs=0.051)
-    assert np.all(answer.local["zero_gain"] < 0) and np.all(answer.local[indices.ZERO] < 0)
+    assert np.all(answer.local["zero_gain"] < 0) and np.all(answer.local[example.ZERO] < 0)
 
 
 def test_losses_are_read_off_what_was_received(outcome):
@@ -192,7 +181,7 @@ def test_losses_are_read_off_what_was_received(outcome):
 
 
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
-    answer = growth.violation(SETTING, 0, nodes[0].horizon)
+    answer = example.violation(SETTING, 0, nodes[0].horizon)
     assert answer.level - 4 * answer.standard_error > nodes[0].horizon.level
 
 
@@ -202,14 +191,16 @@ def result(nodes, outcome):
     finding = hg.h_infinity.check_growth(dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
     size = finding._replace(ratio=0.69, differences=False)
     filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_known"]
-    errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
+    errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in discriminating.SCENARIOS}
     over = {
-        s: {n: np.linspace(1, 2 + i, structured.STEPS) for i, n in enumerate(filters)} for s in structured.SCENARIOS
+        s: {n: np.linspace(1, 2 + i, discriminating.STEPS) for i, n in enumerate(filters)}
+        for s in discriminating.SCENARIOS
     }
     worst = {n: worst_disturbance.Worst(6.0 + i, 0.01, None) for i, n in enumerate(filters[:-1])}
-    designs = {n: {k: nodes[0].horizon for k in structured.OUTPUTS} for n in filters[:3]}
+    designs = {n: {k: nodes[0].horizon for k in discriminating.OUTPUTS} for n in filters[:3]}
     second = discriminating.Discriminating(
-        designs, {k: nodes[0].certificate for k in structured.OUTPUTS}, {k: 1.0 for k in structured.OUTPUTS}, 1.0, size,
+        designs, {k: nodes[0].certificate for k in discriminating.OUTPUTS},
+        dict.fromkeys(discriminating.OUTPUTS, 1.0), 1.0, size,
         errors, errors, over, worst, 100,
     )  # fmt: skip
     shown = outcome.record.estimates["fused"]
@@ -217,7 +208,7 @@ def result(nodes, outcome):
     also = {f"horizon.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
     estimates = outcome.record.estimates | {"fused": shown | known | also}
     whole = replace(outcome, record=replace(outcome.record, estimates=estimates), filters=(*outcome.filters, "horizon"))
-    replayed = indices.replay(outcome)
+    replayed = example.replay(outcome)
     parts = Parts(
         SETTING,
         nodes,
@@ -227,12 +218,12 @@ def result(nodes, outcome):
         whole,
         example.Runs(SETTING, whole.record, ("ekf_known",)),
         replayed,
-        indices.indices(outcome, replayed),
-        growth.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
+        example.indices(outcome, replayed),
+        example.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
         levels.TrueGrowth(*np.full((3, 4, 2), 0.04), True),
         second,
     )
-    return compute.Outcome(numbers.numbers(parts), parts)
+    return compute.Outcome(compute.numbers(parts), parts)
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +266,9 @@ def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(folder / "record.nc", engine="h5netcdf") as record:
         assert record["gain"].shape == (4, 16, 2, 2)
-        assert record["second_mean_fused_error"].sel(filter="ekf_known", scenario="white").shape == (structured.STEPS,)
+        assert record["second_mean_fused_error"].sel(filter="ekf_known", scenario="white").shape == (
+            discriminating.STEPS,
+        )
     assert "true but empty" in (folder / "report.html").read_text()
     fits(folder / "report.html")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.testing import check_quantizer
-from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
+from heliograph_studies.h_infinity_fusion.setting import ZoomQuantizer
 from tests.fusion.test_quantizer import check_no_number
 
 

@@ -10,8 +10,13 @@ import heliograph as hg
 from heliograph.numerics.check import InputError
 from heliograph.planning import Error, independent_paths, split_power
 from heliograph.planning.paths.model import path_information
-from heliograph_studies.network_design.theory import best_schedule, burst_sending, choose_sensors, steady_error
-from heliograph_studies.network_design.theory.sending import necklaces
+from heliograph_studies.network_design.theory import (
+    best_schedule,
+    burst_sending,
+    choose_sensors,
+    necklaces,
+    steady_error,
+)
 from tests.planning.example import direct_paths, error_at, relayed_paths
 
 PATHS = direct_paths()

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from heliograph_studies import quadratic_bias
-from heliograph_studies.quadratic_bias import printed, setting
-from heliograph_studies.quadratic_bias.statements import statements
+from heliograph_studies.quadratic_bias import compute, setting, statements
 from heliograph_studies.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
 from tests.studies.readme import README, said_of
@@ -120,7 +119,7 @@ def test_outage_covariances_are_the_oracles():
         eps0=oracle.two_point(-0.3, 0.3, 0.5), w=oracle.two_point((1 - p) * p**-0.5, -(p**0.5), p),
         xi=oracle.two_point(-0.1, 0.1, 0.5), v=shock, varpi=shock, sigma=shock,
     )  # fmt: skip
-    result = printed.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
+    result = compute.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
     expected = oracle.quadratic(system, 40, repaired=False)
     np.testing.assert_allclose(result.true_covariance, expected.true[1:, :2, :2], rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(result.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)

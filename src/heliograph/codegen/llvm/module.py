@@ -72,8 +72,8 @@ def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
     """Store nodes in new memory, constants too."""
     flat: list[Node] = nodes.ravel().tolist()
     buffer = Buffer("scratch", flat[0].type if flat else "f64", nodes.shape, lowering.graph.current)
-    for place, node in enumerate(flat):
-        lowering.graph.store(buffer, node, place, (), ())
+    for index, node in enumerate(flat):
+        lowering.graph.store(buffer, node, index, (), ())
     return InMemory.whole(buffer)
 
 
@@ -187,8 +187,8 @@ def _blocks(
 ) -> str:
     """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
     names = _pointers(writer, pointers, in_shared)
-    for buffer, place in in_scratch.items():
-        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {place}")
+    for buffer, offset in in_scratch.items():
+        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
     # Loop over blocks; the block `number` has runs from `first` on.
     writer.line("%last = sub i64 %runs, 1")
     writer.line("br label %block")
@@ -230,8 +230,8 @@ def _blocks(
 def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
     """Make the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
     width = writer.width
-    place = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
-    run = writer.add(f"load i32, ptr {place}, align 4")
+    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
+    run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
     count = writer.add("sub i64 %runs, %first")
     first = writer.add(f"insertelement <{width} x i64> poison, i64 {count}, i64 0")
@@ -257,8 +257,8 @@ def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, in
     """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):
-        place = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")
-        name = writer.add(f"load ptr, ptr {place}, align 8")
+        address = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")
+        name = writer.add(f"load ptr, ptr {address}, align 8")
         if buffer is None:
             writer.slots.base = name
         else:

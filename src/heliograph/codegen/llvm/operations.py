@@ -43,26 +43,26 @@ def splat(value: float | int | bool, type: Type) -> str:
 def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
     """Emit the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
-    local, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
-    op, result = node.op, vector(node.type, width)
+    operand_type, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
+    op, result_type = node.op, vector(node.type, width)
     if op == "select":
-        return emit(f"select {local} {names[0]}, {result} {names[1]}, {result} {names[2]}")
+        return emit(f"select {operand_type} {names[0]}, {result_type} {names[1]}, {result_type} {names[2]}")
     # Comparisons and conversions depend on the type of the arguments.
     if op in ORDER:
-        return emit(f"{_comparison(op, source)} {local} {names[0]}, {names[1]}")
+        return emit(f"{_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
     if op == "convert":
         return _converted(source, node.type, names[0], width, emit)
     if op == "bitcast":
-        return emit(f"bitcast {local} {names[0]} to {result}")
+        return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
     if op == "not":
-        return emit(f"xor {local} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+        return emit(f"xor {operand_type} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
     # Functions of `vector_math`, then arithmetic by type.
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
-        return emit(f"call {result} @hg_{op}({typed})")
+        return emit(f"call {result_type} @hg_{op}({typed})")
     if source == "f64":
-        return _of_doubles(op, names, local, kind, width, emit)
-    return _of_integers(node, names, local, kind, emit)
+        return _of_doubles(op, names, operand_type, kind, width, emit)
+    return _of_integers(node, names, operand_type, kind, emit)
 
 
 def _comparison(op: str, type: Type) -> str:
@@ -89,9 +89,9 @@ def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emi
         return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
     # sign x = x for zeros and NaN.
     if op == "sign":
-        item = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
+        signed = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
         other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
-        return emit(f"select <{width} x i1> {other}, {text} {item}, {first}")
+        return emit(f"select <{width} x i1> {other}, {text} {signed}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
     raise Unsupported(op)
@@ -119,27 +119,27 @@ def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit)
 
 
 def _converted(source: Type, target: Type, name: str, width: int, emit: Emit) -> str:
-    local, result = vector(source, width), vector(target, width)
+    operand_type, result_type = vector(source, width), vector(target, width)
     if source == target or LLVM[source] == LLVM[target]:
         return name
     if target == "f64":
-        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {local} {name} to {result}")
+        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {operand_type} {name} to {result_type}")
     if source == "f64":
         how = "fptosi" if target[0] == "i" else "fptoui"
         suffix = f"v{width}{LLVM[target]}.v{width}f64"
-        return emit(f"call {result} @llvm.{how}.sat.{suffix}({local} {name})")
+        return emit(f"call {result_type} @llvm.{how}.sat.{suffix}({operand_type} {name})")
     if BITS[target] < BITS[source]:
-        return emit(f"trunc {local} {name} to {result}")
-    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {local} {name} to {result}")
+        return emit(f"trunc {operand_type} {name} to {result_type}")
+    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {operand_type} {name} to {result_type}")
 
 
 def fused(node: Node, product: Node, names: list[str], width: int, emit: Emit) -> str:
     """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
-    local = vector("f64", width)
+    doubles = vector("f64", width)
     a, b, c = names
     if node.op == "sub":
         if node.args[1] is product:
-            a = emit(f"fneg {local} {a}")
+            a = emit(f"fneg {doubles} {a}")
         else:
-            c = emit(f"fneg {local} {c}")
-    return emit(f"call {local} @llvm.fma.v{width}f64({local} {a}, {local} {b}, {local} {c})")
+            c = emit(f"fneg {doubles} {c}")
+    return emit(f"call {doubles} @llvm.fma.v{width}f64({doubles} {a}, {doubles} {b}, {doubles} {c})")

@@ -22,7 +22,7 @@ class Slots:
         self.places: dict[Node, int] = {}
         self.base = ""
 
-    def place(self, node: Node) -> int:
+    def offset_of(self, node: Node) -> int:
         """Return the offset of a number, assigned at its first use."""
         if node not in self.places:
             self.places[node] = self.size
@@ -44,20 +44,20 @@ class Slots:
         """Store a number if the other function uses it."""
         if node not in self.places or writer.width != 1:
             return
-        local = vector(node.type, 1)
+        kind = vector(node.type, 1)
         address = self._address(writer, node)
         if node.type == "bool":
-            name, local = writer.add(f"zext {local} {name} to <1 x i8>"), "<1 x i8>"
-        writer.line(f"store {local} {name}, ptr {address}, align 1")
+            name, kind = writer.add(f"zext {kind} {name} to <1 x i8>"), "<1 x i8>"
+        writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
     def _address(self, writer: Writer, node: Node) -> str:
-        place, stride, index = self.place(node), 8, ""
+        offset, stride, index = self.offset_of(node), 8, ""
         for loop in loops_of(node):
             assert loop.counter is not None
-            part = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
-            index = writer.add(f"add i64 {index}, {part}") if index else part
+            step = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
+            index = writer.add(f"add i64 {index}, {step}") if index else step
             stride *= loop.length or 1
-        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {place}")
+        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {offset}")
         return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
 

@@ -47,18 +47,18 @@ class Writer:
 
     def block(self, block: Block) -> None:
         """Write operations and statements in order."""
-        for item in block.items:
-            if item not in self.mine:
+        for statement in block.items:
+            if statement not in self.mine:
                 continue
-            if isinstance(item, Node):
-                if item not in self.products:
-                    self._keep(item, self._compute(item))
-            elif isinstance(item, Store):
-                self._store(item)
-            elif isinstance(item, Loop):
-                self._loop(item)
-            elif isinstance(item, Guard):
-                self._guard(item)
+            if isinstance(statement, Node):
+                if statement not in self.products:
+                    self._keep(statement, self._compute(statement))
+            elif isinstance(statement, Store):
+                self._store(statement)
+            elif isinstance(statement, Loop):
+                self._loop(statement)
+            elif isinstance(statement, Guard):
+                self._guard(statement)
 
     def _keep(self, node: Node, name: str) -> None:
         self.scopes[-1][node] = name
@@ -109,9 +109,9 @@ class Writer:
         return node.op in ("constant", "counter") or node not in self.mine or self.width == 1
 
     def _everywhere(self, name: str, type: Type) -> str:
-        local = vector(type, self.width)
-        first = self.add(f"insertelement {local} poison, {LLVM[type]} {name}, i64 0")
-        return self.add(f"shufflevector {local} {first}, {local} poison, <{self.width} x i32> zeroinitializer")
+        kind = vector(type, self.width)
+        first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
+        return self.add(f"shufflevector {kind} {first}, {kind} poison, <{self.width} x i32> zeroinitializer")
 
     def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
         """Return the address of entry offset + sum strides * indices, for entries of this many lanes."""
@@ -120,14 +120,14 @@ class Writer:
         base = self.bases[owner]
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
-            result = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
-            if result is None:
-                place = ""
+            row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+            if row is None:
+                moved = ""
                 for stride, index in zip(strides, indices, strict=True):
-                    part = self.add(f"mul i64 {self.scalar(index)}, {stride}")
-                    place = self.add(f"add i64 {place}, {part}") if place else part
-                result = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {place}")
-            base = result
+                    step = self.add(f"mul i64 {self.scalar(index)}, {stride}")
+                    moved = self.add(f"add i64 {moved}, {step}") if moved else step
+                row = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {moved}")
+            base = row
         return self.add(f"getelementptr {element}, ptr {base}, i64 {offset + start}")
 
     def _load(self, node: Node) -> str:
@@ -159,37 +159,37 @@ class Writer:
         if lanes == 1:
             self.read.add(owner)
         # Place of each lane: (offset + sum strides * indices) lanes + lane.
-        wide, local = f"<{self.width} x i64>", vector(node.type, self.width)
-        place = f"splat (i64 {(offset + start) * lanes})"
+        wide, kind = f"<{self.width} x i64>", vector(node.type, self.width)
+        positions = f"splat (i64 {(offset + start) * lanes})"
         for stride, index in zip(strides, node.args, strict=True):
-            part = self.add(f"mul {wide} {self.operand(index)}, splat (i64 {stride * lanes})")
-            place = self.add(f"add {wide} {part}, {place}")
+            step = self.add(f"mul {wide} {self.operand(index)}, splat (i64 {stride * lanes})")
+            positions = self.add(f"add {wide} {step}, {positions}")
         if lanes > 1:
             numbers = ", ".join(f"i64 {lane}" for lane in range(self.width))
-            place = self.add(f"add {wide} {place}, <{numbers}>")
+            positions = self.add(f"add {wide} {positions}, <{numbers}>")
         # One load for each lane; booleans are stored as bytes.
         bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
         loaded = "poison"
         for lane in range(self.width):
-            at = self.add(f"extractelement {wide} {place}, i64 {lane}")
+            at = self.add(f"extractelement {wide} {positions}, i64 {lane}")
             address = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, i64 {at}")
-            item = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
-            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {item}, i64 {lane}")
+            entry = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {entry}, i64 {lane}")
         if node.type == "bool":
             return self.add(f"icmp ne {values} {loaded}, zeroinitializer")
-        return self.add(f"bitcast {values} {loaded} to {local}") if node.type == "f64" else loaded
+        return self.add(f"bitcast {values} {loaded} to {kind}") if node.type == "f64" else loaded
 
     def _store(self, store: Store) -> None:
-        name, local = self.operand(store.node), vector(store.node.type, self.width)
+        name, kind = self.operand(store.node), vector(store.node.type, self.width)
         lanes = self.sums.get(store.buffer, self.width)
         address = self._address(store.buffer, store.offset, store.strides, store.indices, lanes)
         if store.buffer in self.sums:
-            before = self.add(f"load {local}, ptr {address}, align 8")
-            counted = self.add(f"select <{self.width} x i1> {self.counted}, {local} {name}, {local} zeroinitializer")
-            name = self.add(f"fadd {local} {before}, {counted}")
+            before = self.add(f"load {kind}, ptr {address}, align 8")
+            counted = self.add(f"select <{self.width} x i1> {self.counted}, {kind} {name}, {kind} zeroinitializer")
+            name = self.add(f"fadd {kind} {before}, {counted}")
         if store.node.type == "bool":
-            name, local = self.add(f"zext {local} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
-        self.line(f"store {local} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
+            name, kind = self.add(f"zext {kind} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
+        self.line(f"store {kind} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
 
     def _loop(self, loop: Loop) -> None:
         """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
@@ -201,7 +201,7 @@ class Writer:
         starts = [self.operand(loop.initial[k]) for k in moving]
         self.line(f"br label %{name}")
         self.start(name)
-        place = len(self.lines)
+        begin = len(self.lines)
         self.scopes.append({})
         counter = f"%{name}.counter"
         if loop.counter is not None:
@@ -227,7 +227,7 @@ class Writer:
         for k, start, after in zip(moving, starts, following, strict=True):
             kind = vector(loop.parameters[k].type, self.width)
             phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{before}], [{after}, %{self.label}]")
-        self.lines[place:place] = phis
+        self.lines[begin:begin] = phis
         self.start(f"{name}.end")
         self.scopes.pop()
         for k, final in zip(moving, finals, strict=True):
@@ -235,11 +235,14 @@ class Writer:
 
     def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
         """Write a loop that ends when no lane's condition holds."""
-        check = next(i for i, item in enumerate(loop.body.items) if isinstance(item, Check) and item.loop is loop)
+        # The body up to the loop's check, and what follows it in a turn.
+        checks = (i for i, s in enumerate(loop.body.items) if isinstance(s, Check) and s.loop is loop)
+        check = next(checks)
         head, tail = Block(loop.body.parent), Block(loop.body.parent)
         head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
         self.block(head)
         assert loop.condition is not None
+        # Another turn if some lane needs it.
         some = self._any(loop.condition)
         self.line(f"br i1 {some}, label %{name}.turn, label %{name}.end")
         self.start(f"{name}.turn")
@@ -252,8 +255,8 @@ class Writer:
 
     def _any(self, condition: Node) -> str:
         """Emit whether a condition holds in some lane."""
-        local = f"<{self.width} x i1>"
-        bits = self.add(f"bitcast {local} {self.operand(condition)} to i{self.width}")
+        flags = f"<{self.width} x i1>"
+        bits = self.add(f"bitcast {flags} {self.operand(condition)} to i{self.width}")
         return self.add(f"icmp ne i{self.width} {bits}, 0")
 
     def _guard(self, guard: Guard) -> None:
@@ -274,5 +277,5 @@ class Writer:
         self.scopes.pop()
         # Results are zero where the body was skipped.
         for k, value in zip(used, values, strict=True):
-            local = vector(guard.results[k].type, self.width)
-            self._keep(guard.results[k], self.add(f"phi {local} [{value}, %{after}], [zeroinitializer, %{before}]"))
+            kind = vector(guard.results[k].type, self.width)
+            self._keep(guard.results[k], self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))

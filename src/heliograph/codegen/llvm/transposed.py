@@ -45,9 +45,9 @@ def mover(bits: int, width: int, inwards: bool) -> str:
         # Address of each lane's run.
         rows = []
         for lane in range(group, group + lanes):
-            place = text.add(f"add i64 %first, {lane}")
-            place = text.add(f"call i64 @llvm.smin.i64(i64 {place}, i64 %last)")
-            start = text.add(f"mul i64 {place}, %size")
+            run = text.add(f"add i64 %first, {lane}")
+            run = text.add(f"call i64 @llvm.smin.i64(i64 {run}, i64 %last)")
+            start = text.add(f"mul i64 {run}, %size")
             rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
         # Squares of eight by eight, then the remaining entries.
         start = "0"
@@ -81,18 +81,18 @@ def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) 
 
 def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
     """Do one step of a transposition: exchange off-diagonal squares of this size."""
-    result = rows[:]
+    exchanged = rows[:]
     for i in range(EIGHT):
         if i & half:
             continue
         j = i | half
         low = [k if not k & half else k - half + EIGHT for k in range(EIGHT)]
         high = [k + half if not k & half else k + EIGHT for k in range(EIGHT)]
-        for place, order in ((i, low), (j, high)):
+        for row, order in ((i, low), (j, high)):
             mask = ", ".join(f"i32 {k}" for k in order)
             pair = f"<8 x i64> {rows[i]}, <8 x i64> {rows[j]}"
-            result[place] = text.add(f"shufflevector {pair}, <8 x i32> <{mask}>")
-    return result
+            exchanged[row] = text.add(f"shufflevector {pair}, <8 x i32> <{mask}>")
+    return exchanged
 
 
 def _single(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:

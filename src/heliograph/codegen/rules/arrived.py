@@ -19,8 +19,8 @@ _arrived: Any = Primitive("arrived")
 
 def arrived(x: jax.Array) -> jax.Array:
     """Return the same numbers, marked by the caller as never NaN in place of a missing one."""
-    result: jax.Array = _arrived.bind(x)
-    return result
+    marked: jax.Array = _arrived.bind(x)
+    return marked
 
 
 def _rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:

@@ -36,10 +36,10 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 def _expanded(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
-    item = equation.params["_prim"]
+    primitive = equation.params["_prim"]
 
     def function(*leaves: jax.Array) -> list[jax.Array]:
-        return jax.tree.leaves(item.expand(*jax.tree.unflatten(item.in_tree, leaves)))
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
 
     avals: list[Any] = [v.aval for v in equation.invars]
     struct: Any = jax.ShapeDtypeStruct
@@ -71,9 +71,9 @@ def _over(
     differs = [x.shape[-1] > 1 for x in inputs]
     rows = [in_memory(lowering, x) if d else _run(x, 0) for x, d in zip(inputs, differs, strict=True)]
 
-    def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        item = [_run(x, place) if d else x for x, d in zip(rows, differs, strict=True)]
-        return [], [lowering.nodes(x) for x in _over(lowering, equation, item, rest, shapes)]
+    def turn(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        row = [_run(x, index) if d else x for x, d in zip(rows, differs, strict=True)]
+        return [], [lowering.nodes(x) for x in _over(lowering, equation, row, rest, shapes)]
 
     stacked = repeated(lowering, count, [], turn)[1]
     return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
@@ -103,13 +103,13 @@ def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     return lowering.inline(lowering.kernels[key], inputs)
 
 
-def _run(x: Value, place: Node | int) -> Value:
+def _run(x: Value, index: Node | int) -> Value:
     """Return one run's part of an argument whose last axis is that of runs, or a number shared by all."""
     if isinstance(x, InMemory):
         last = x.view([x.shape[-1], *x.shape[:-1]], [x.strides[-1], *x.strides[:-1]])
-        return last.row(0 if x.shape[-1] == 1 else place)
+        return last.row(0 if x.shape[-1] == 1 else index)
     flat = x.reshape(-1, x.shape[-1])
-    return flat[:, min(int(place), x.shape[-1] - 1)].reshape(x.shape[:-1])  # type: ignore[arg-type]
+    return flat[:, min(int(index), x.shape[-1] - 1)].reshape(x.shape[:-1])  # type: ignore[arg-type]
 
 
 def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -185,20 +185,20 @@ def _result(lowering: Lowering, guard: Guard, value: Any) -> Any:
         return value
     if value in guard.values:
         return guard.results[guard.values.index(value)]
-    result = lowering.graph.fresh("guarded", value.type, (), lowering.graph.current, (guard, len(guard.values)))
+    guarded = lowering.graph.fresh("guarded", value.type, (), lowering.graph.current, (guard, len(guard.values)))
     guard.values.append(value)
-    guard.results.append(result)
-    return result
+    guard.results.append(guarded)
+    return guarded
 
 
 def _size(block: Block) -> int:
     """Count the nodes of a block; a statement in it counts as many."""
-    return sum(1 if isinstance(item, Node) else DEAR + 1 for item in block.items)
+    return sum(1 if isinstance(statement, Node) else DEAR + 1 for statement in block.items)
 
 
 def _dissolve(block: Block, outer: Block) -> None:
-    for item in block.items:
-        item.block = outer  # type: ignore[union-attr]
+    for statement in block.items:
+        statement.block = outer  # type: ignore[union-attr]
     outer.items += block.items
     outer.seen |= block.seen
 

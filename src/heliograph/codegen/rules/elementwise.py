@@ -28,7 +28,7 @@ def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list
 def _elementwise(op: str) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
-        return [array_of([node(op, type, *item) for item in zip(*broadcast(inputs, shape), strict=True)], shape)]
+        return [array_of([node(op, type, *nodes) for nodes in zip(*broadcast(inputs, shape), strict=True)], shape)]
 
     return rule
 
@@ -76,9 +76,9 @@ def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
         exponent //= 2
         if exponent:
             square = graph.node("mul", type, square, square)
-    item = graph.constant(1.0 if type == "f64" else 1, type)
-    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, item)
-    return product if params["y"] >= 0 else graph.node("div", type, item, product)
+    unit = graph.constant(1.0 if type == "f64" else 1, type)
+    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
+    return product if params["y"] >= 0 else graph.node("div", type, unit, product)
 
 
 def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
@@ -99,9 +99,9 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    item = graph.constant(1.0, type)
+    unit = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
-    return graph.node("div", type, item, graph.node("add", type, item, power))
+    return graph.node("div", type, unit, graph.node("add", type, unit, power))
 
 
 def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:
@@ -122,10 +122,10 @@ def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
     """Evaluate a polynomial by Horner's rule, of coefficients from degree 0 up."""
-    result = coefficients[-1]
+    value = coefficients[-1]
     for c in reversed(coefficients[:-1]):
-        result = graph.node("add", type, graph.node("mul", type, result, x), c)
-    return result
+        value = graph.node("add", type, graph.node("mul", type, value, x), c)
+    return value
 
 
 def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:

@@ -46,8 +46,8 @@ def _places(
     # Offsets of the entries of a window from its corner.
     left = [a for a in range(len(shape)) if a not in removed]
     offsets = np.zeros([sizes[a] for a in left], dtype=np.int64)
-    for place, a in enumerate(left):
-        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == place else 1 for p in range(len(left))])
+    for position, a in enumerate(left):
+        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == position else 1 for p in range(len(left))])
     places = np.reshape(base, (*base.shape, *[1] * offsets.ndim)) + offsets
     return np.maximum(places, -1)
 
@@ -77,8 +77,8 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
         dtype = aval.dtype  # type: ignore[attr-defined]
         missing = (np.nan if dtype.kind == "f" else np.iinfo(dtype).min) if missing is None else missing
         flat = np.append(flat, lowering.known(np.full((), missing, dtype)))
-    result: np.ndarray = flat[places]
-    return [result]
+    gathered: np.ndarray = flat[places]
+    return [gathered]
 
 
 def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
@@ -87,48 +87,48 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
     """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
-    axis = numbers.start_index_map[place]
+    column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[column]
     last = x.shape[axis] - sizes[axis]
     if last >= FEW:
-        return _from_memory(lowering, equation, x, indices, place)
-    cases = [_gather(lowering, equation, [x, _with(lowering, indices, place, n)])[0] for n in range(last + 1)]
-    result = cases[-1].copy()
-    for entry in np.ndindex(*result.shape):
-        which = indices[(*_row(entry, numbers), place)]
+        return _from_memory(lowering, equation, x, indices, column)
+    cases = [_gather(lowering, equation, [x, _with(lowering, indices, column, n)])[0] for n in range(last + 1)]
+    selected = cases[-1].copy()
+    for entry in np.ndindex(*selected.shape):
+        which = indices[(*_row(entry, numbers), column)]
         if which.op != "constant":
             here = [np.array(case[entry], dtype=object) for case in cases]
-            result[entry] = chosen(lowering.graph, which, here)[()]
-    return result
+            selected[entry] = chosen(lowering.graph, which, here)[()]
+    return selected
 
 
-def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, place: int) -> np.ndarray:
+def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int) -> np.ndarray:
     """Gather from memory if there are many places: each entry is loaded at an offset by its row's index."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    axis = numbers.start_index_map[place]
-    begin = _with(lowering, indices, place, 0)
+    axis = numbers.start_index_map[column]
+    begin = _with(lowering, indices, column, 0)
     if known_integers(begin) is None:
         raise Unsupported("gather at two places that data decide")
     starts = _gather(lowering, equation, [np.arange(x.size, dtype=object).reshape(x.shape), begin])[0]
     buffer, stride = in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
-    result = np.empty(starts.shape, dtype=object)
-    for entry in np.ndindex(*result.shape):
-        first = clamped(lowering, indices[(*_row(entry, numbers), place)], x.shape[axis] - sizes[axis])
+    loaded = np.empty(starts.shape, dtype=object)
+    for entry in np.ndindex(*loaded.shape):
+        first = clamped(lowering, indices[(*_row(entry, numbers), column)], x.shape[axis] - sizes[axis])
         if isinstance(first, int):
-            result[entry] = x.ravel()[starts[entry]]
+            loaded[entry] = x.ravel()[starts[entry]]
         else:
-            result[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
-    return result
+            loaded[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
+    return loaded
 
 
-def _with(lowering: Lowering, indices: np.ndarray, place: int, number: int) -> np.ndarray:
+def _with(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
     """Replace the indices that depend on data by a number."""
-    result = indices.copy()
+    replaced = indices.copy()
     for row in np.ndindex(*indices.shape[:-1]):
-        node = indices[(*row, place)]
+        node = indices[(*row, column)]
         if node.op != "constant":
-            result[(*row, place)] = lowering.graph.constant(number, node.type)
-    return result
+            replaced[(*row, column)] = lowering.graph.constant(number, node.type)
+    return replaced
 
 
 def _row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
@@ -154,11 +154,11 @@ def _scatter(op: str | None) -> Rule:
         places = _places(x.shape, sizes, at, index_map, batching, removed, _clips(params["mode"]))
         places = np.moveaxis(places, range(at.ndim - 1, places.ndim), numbers.update_window_dims)
         # Apply the updates in order.
-        result = x.ravel().copy()
-        for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
-            if place >= 0:
-                result[place] = new if op is None else lowering.graph.node(op, new.type, result[place], new)
-        return [result.reshape(x.shape)]
+        updated = x.ravel().copy()
+        for index, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if index >= 0:
+                updated[index] = new if op is None else lowering.graph.node(op, new.type, updated[index], new)
+        return [updated.reshape(x.shape)]
 
     return rule
 

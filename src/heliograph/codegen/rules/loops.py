@@ -21,7 +21,7 @@ def repeated(
 ) -> tuple[list[np.ndarray], list[InMemory]]:
     """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
 
-    turn(place, carry) returns the next carry, and what is stacked at that place; places run from 0 up, or down to 0.
+    turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or down to 0.
     """
     graph, outer = lowering.graph, lowering.graph.current
     body = Block(outer)
@@ -29,17 +29,17 @@ def repeated(
     loop.counter = counter = graph.fresh("counter", "i64", (), body, loop)
     # In the body the carry is a parameter; the turn is traced once.
     loop.parameters = [
-        graph.fresh("parameter", n.type, (), body, (loop, place)) for place, n in enumerate(loop.initial)
+        graph.fresh("parameter", n.type, (), body, (loop, index)) for index, n in enumerate(loop.initial)
     ]
     graph.current = body
-    place = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
-    following, stacked = turn(place, _like(carry, loop.parameters))
+    row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
+    following, stacked = turn(row, _like(carry, loop.parameters))
     loop.following = [n for x in following for n in scalars(x)]
     memory = [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
     graph.current = outer
     outer.items.append(loop)
     # After the loop the carry is a result.
-    loop.results = [graph.fresh("result", n.type, (), outer, (loop, place)) for place, n in enumerate(loop.initial)]
+    loop.results = [graph.fresh("result", n.type, (), outer, (loop, index)) for index, n in enumerate(loop.initial)]
     return _like(carry, loop.results), memory
 
 
@@ -88,11 +88,11 @@ def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
     rows = [in_memory(lowering, x) for x in rows]
 
-    # One turn: the body for row `place` of the stacked arguments.
-    def turn(place: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    # One turn: the body for one row of the stacked arguments.
+    def turn(row: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         items = iter(moving)
         now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
-        results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(place) for x in rows)])
+        results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(row) for x in rows)])
         nodes = [lowering.nodes(x) for x in results]
         return [x for x, s in zip(nodes[:carried], same, strict=True) if not s], nodes[carried:]
 
@@ -127,7 +127,7 @@ def _written_out(
         return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
     if params["reverse"]:
         stacked.reverse()
-    return [*carry, *(np.stack(item) for item in zip(*stacked, strict=True))]
+    return [*carry, *(np.stack(leaves) for leaves in zip(*stacked, strict=True))]
 
 
 def _entry(x: np.ndarray, turn: int) -> np.ndarray:
@@ -146,14 +146,14 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
         table = np.array([n.value for n in flat]).reshape(value.shape)
         return InMemory.whole(Buffer("table", type, value.shape, graph.top, table))
     buffer = Buffer("scratch", type, value.shape, graph.current)
-    for place, node in enumerate(flat):
-        graph.store(buffer, node, place, (), ())
+    for index, node in enumerate(flat):
+        graph.store(buffer, node, index, (), ())
     return InMemory.whole(buffer)
 
 
 def copied(lowering: Lowering, x: InMemory) -> InMemory:
     """Copy a long array to new memory."""
-    return repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1][0]
+    return repeated(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
 
 def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -35,8 +35,8 @@ def _cumulative(op: str) -> Rule:
         rows = [x[0].tolist()]
         for row in x[1:].tolist():
             rows.append([lowering.graph.node(op, type, a, b) for a, b in zip(rows[-1], row, strict=True)])
-        result = array_of([n for row in rows for n in row], np.moveaxis(inputs[0], axis, 0).shape)
-        return [np.moveaxis(result[::-1] if equation.params["reverse"] else result, 0, axis)]
+        cumulated = array_of([n for row in rows for n in row], np.moveaxis(inputs[0], axis, 0).shape)
+        return [np.moveaxis(cumulated[::-1] if equation.params["reverse"] else cumulated, 0, axis)]
 
     return rule
 
@@ -51,7 +51,7 @@ def _arg(op: str) -> Rule:
         )
         results = []
         for row in x.tolist():
-            best, place = row[0], graph.constant(0, type)
+            best, index = row[0], graph.constant(0, type)
             for number, entry in enumerate(row[1:], 1):
                 # A later entry replaces the best one if it is beyond it or NaN, unless the best is NaN.
                 known = graph.node("eq", "bool", best, best)
@@ -59,8 +59,8 @@ def _arg(op: str) -> Rule:
                 is_nan = graph.node("ne", "bool", entry, entry)
                 better = graph.node("and", "bool", known, graph.node("or", "bool", beyond, is_nan))
                 best = graph.node("select", entry.type, better, entry, best)
-                place = graph.node("select", type, better, graph.constant(number, type), place)
-            results.append(place)
+                index = graph.node("select", type, better, graph.constant(number, type), index)
+            results.append(index)
         return [array_of(results, result_shape(equation))]
 
     return rule
@@ -132,14 +132,14 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
     if transposed:
         a, lower = a.T, not lower
     # x_i = (b_i - sum_j a_ij x_j) / a_ii, in the order of substitution.
-    n, item = len(a), graph.constant(1.0, "f64")
-    scales = [item if params["unit_diagonal"] else graph.node("div", "f64", item, a[i, i]) for i in range(n)]
+    n, unit = len(a), graph.constant(1.0, "f64")
+    scales = [unit if params["unit_diagonal"] else graph.node("div", "f64", unit, a[i, i]) for i in range(n)]
     x = np.empty(b.shape, dtype=object)
     order = list(range(n)) if lower else list(range(n))[::-1]
-    for place, i in enumerate(order):
+    for step, i in enumerate(order):
         for column in range(b.shape[1]):
             rest = b[i, column]
-            for j in order[:place]:
+            for j in order[:step]:
                 rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", a[i, j], x[j, column]))
             x[i, column] = graph.node("mul", "f64", rest, scales[i])
     return x if params["left_side"] else x.T

@@ -171,10 +171,10 @@ def hash_function(width: int) -> str:
     # Both words as one of 64 bits.
     wide = f"<{width} x i64>"
     high, low = op(f"zext {vector} {x} to {wide}"), op(f"zext {vector} {y} to {wide}")
-    result = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")
+    word = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")
     words = ", ".join(f"{vector} %{name}" for name in "abxy")
     body = "\n".join(lines)
     return (
         f"declare {vector} {rotate}({vector}, {vector}, {vector})\n"
-        f"define internal {wide} @hg_threefry({words}) noinline nounwind {{\n{body}\n  ret {wide} {result}\n}}\n"
+        f"define internal {wide} @hg_threefry({words}) noinline nounwind {{\n{body}\n  ret {wide} {word}\n}}\n"
     )

@@ -39,11 +39,11 @@ def _of_entries(name: str) -> Rule:
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
         items = [x if len(x.shape) < len(shape) or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
-        item = like_row(equation)
+        row_equation = like_row(equation)
 
-        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            rows = [row_of(lowering, x, place, len(shape)) for x in items]
-            return [], list(lowering.equation(item, rows))
+        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            rows = [row_of(lowering, x, row, len(shape)) for x in items]
+            return [], list(lowering.equation(row_equation, rows))
 
         return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
 
@@ -56,10 +56,10 @@ def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tu
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
-def row_of(lowering: Lowering, x: Value, place: Node, ndim: int) -> Value:
+def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
     """Return the part of an argument that a row of the result needs."""
     if isinstance(x, InMemory):
-        return x.row(place)
+        return x.row(row)
     return x[:1].reshape(x.shape[1:]) if x.ndim == ndim and ndim else x
 
 
@@ -92,11 +92,11 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
             raise Unsupported("a sum of products over a long array")
         a, numbers = _first(a, free), ((_without(left, free), right), ((), ()))
     # The operation on one row, in a loop.
-    item = like_row(equation, dimension_numbers=numbers)
+    row_equation = like_row(equation, dimension_numbers=numbers)
 
-    def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        rows = [a.row(place), b.row(place) if left_batch else b]
-        return as_nodes(lowering, ([], list(lowering.equation(item, rows))))
+    def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        rows = [a.row(row), b.row(row) if left_batch else b]
+        return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
 
     return list(repeated(lowering, a.shape[0], [], turn)[1])
 
@@ -124,20 +124,20 @@ def _reduction(name: str) -> Rule:
         dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
         row = SimpleNamespace(aval=like(shape, dtype))
         params = equation.params | {"axes": inner}
-        item: Any = SimpleNamespace(params=params, outvars=[row])
+        within: Any = SimpleNamespace(params=params, outvars=[row])
         pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
 
-        def reduced(place: Node) -> np.ndarray:
-            return np.asarray(RULES[name](lowering, item, [lowering.nodes(x.row(place))])[0])
+        def reduced(row_index: Node) -> np.ndarray:
+            return np.asarray(RULES[name](lowering, within, [lowering.nodes(x.row(row_index))])[0])
 
         # Rows stay apart, or are accumulated from the neutral element.
         if 0 not in axes:
-            return list(repeated(lowering, x.shape[0], [], lambda place, _: ([], [reduced(place)]))[1])
+            return list(repeated(lowering, x.shape[0], [], lambda row_index, _: ([], [reduced(row_index)]))[1])
         nothing = np.empty((0, *shape), dtype=object)
         start = RULES[name](lowering, pair, [nothing])[0]
 
-        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(place)])])[0])], []
+        def turn(row_index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(row_index)])])[0])], []
 
         return list(repeated(lowering, x.shape[0], [start], turn)[0])
 

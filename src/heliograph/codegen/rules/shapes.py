@@ -53,16 +53,16 @@ def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 def _pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     x, filling = inputs
-    result = np.empty(result_shape(equation), dtype=object)
-    result[...] = filling[()]
+    padded = np.empty(result_shape(equation), dtype=object)
+    padded[...] = filling[()]
     sources, targets = [], []
-    for size, bound, (low, _, inner) in zip(x.shape, result.shape, equation.params["padding_config"], strict=True):
+    for size, bound, (low, _, inner) in zip(x.shape, padded.shape, equation.params["padding_config"], strict=True):
         at = low + np.arange(size) * (1 + inner)
         inside = (at >= 0) & (at < bound)
         sources.append(np.flatnonzero(inside))
         targets.append(at[inside])
-    result[np.ix_(*targets)] = x[np.ix_(*sources)]
-    return [result]
+    padded[np.ix_(*targets)] = x[np.ix_(*sources)]
+    return [padded]
 
 
 def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
@@ -97,12 +97,12 @@ def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
     """One of several arrays, the first for numbers below 0 and the last for numbers beyond."""
     from heliograph.codegen.rules.elementwise import select
 
-    result = cases[-1]
+    selected = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
         here = graph.node("le", "bool", which, graph.constant(number, which.type))
-        pairs = zip(case.ravel().tolist(), result.ravel().tolist(), strict=True)
-        result = array_of([select(graph, here, a, b) for a, b in pairs], case.shape)
-    return result
+        pairs = zip(case.ravel().tolist(), selected.ravel().tolist(), strict=True)
+        selected = array_of([select(graph, here, a, b) for a, b in pairs], case.shape)
+    return selected
 
 
 def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -129,9 +129,9 @@ def _updated(
         first = here if start is None else 0 if whole == size else int(start.value)
         first = min(max(first, 0), whole - size)
         at.append(slice(first, first + size))
-    result = x.copy()
-    result[tuple(at)] = update
-    return result
+    updated = x.copy()
+    updated[tuple(at)] = update
+    return updated
 
 
 RULES |= {

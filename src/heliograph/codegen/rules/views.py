@@ -20,8 +20,8 @@ def _viewed(name: str, view: View) -> Rule:
     """Make a rule of one array: its view, or the rearranged nodes if there is none."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        result = view(inputs[0], equation.params, result_shape(equation))
-        return [result] if result is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+        viewed = view(inputs[0], equation.params, result_shape(equation))
+        return [viewed] if viewed is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
 
     return rule
 
@@ -133,8 +133,8 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     if axis != 0:
         parts = [in_memory(lowering, x) for x in inputs]
 
-        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            return [], [np.concatenate([lowering.nodes(x.row(place)) for x in parts], axis=axis - 1)]
+        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [], [np.concatenate([lowering.nodes(x.row(row)) for x in parts], axis=axis - 1)]
 
         return list(repeated(lowering, shape[0], [], turn)[1])
     return [joined(lowering, inputs, shape)]
@@ -164,8 +164,8 @@ def _is_alone(x: InMemory, block: Any) -> bool:
 def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     graph = lowering.graph
     if x.size <= LONG or not isinstance(x, InMemory):
-        for place, node in enumerate(lowering.nodes(x).ravel().tolist()):
-            graph.store(buffer, node, start + place, (), ())
+        for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
+            graph.store(buffer, node, start + index, (), ())
     else:
         buffer.take_in(copied(lowering, x).buffer, start)
 

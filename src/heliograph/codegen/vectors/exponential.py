@@ -38,9 +38,9 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
     first, rest = _reduced(x, n)
     r = first + (rest + low)
     rest = (first - r) + (rest + low)
-    item = 1 + r
+    leading = 1 + r
     small = fma(r * r, polynomial(r, EXP), fma(r, rest, rest))
-    return _limited(x, _scaled(item + ((1 - item + r) + small), count), 709.782712893384, -745.1332191019412)
+    return _limited(x, _scaled(leading + ((1 - leading + r) + small), count), 709.782712893384, -745.1332191019412)
 
 
 def expm1(x: Vector) -> Vector:
@@ -58,8 +58,8 @@ def log(x: Vector) -> Vector:
     """log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
     small = x < TINY
     k, m = _exponent(select(small, x * 2.0**54, x))
-    result = _log(k - select(small, 54.0, 0.0), m - 1, 0.0)
-    return _with_domain(x, result)
+    value = _log(k - select(small, 54.0, 0.0), m - 1, 0.0)
+    return _with_domain(x, value)
 
 
 def log1p(x: Vector) -> Vector:
@@ -67,8 +67,8 @@ def log1p(x: Vector) -> Vector:
     u = 1 + x
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _exponent(u)
-    result = _log(k, m - 1, rounded / u)
-    return select(abs(x) < 2.0**-54, x, _with_domain(u, result))
+    value = _log(k, m - 1, rounded / u)
+    return select(abs(x) < 2.0**-54, x, _with_domain(u, value))
 
 
 def tanh(x: Vector) -> Vector:
@@ -105,9 +105,9 @@ def _scaled(x: Vector, n: Vector) -> Vector:
     return x * _power(half) * _power(n - half)
 
 
-def _limited(x: Vector, result: Vector, largest: float, smallest: float) -> Vector:
+def _limited(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
     """The result; infinity for x beyond the largest, 0 below the smallest, NaN of NaN."""
-    return select(x > largest, math.inf, select(x < smallest, 0.0, result))
+    return select(x > largest, math.inf, select(x < smallest, 0.0, value))
 
 
 def _exponent(x: Vector) -> tuple[Vector, Vector]:
@@ -127,7 +127,7 @@ def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     return fma(k, LN2_HIGH, f - (half - fma(s, half + r, fma(k, LN2_LOW, more))))
 
 
-def _with_domain(x: Vector, result: Vector) -> Vector:
+def _with_domain(x: Vector, value: Vector) -> Vector:
     """A logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
     special = select(x.equals(0.0), -math.inf, select(x > 0.0, x, math.nan))
-    return select((x > 0.0) & (x < math.inf), result, special)
+    return select((x > 0.0) & (x < math.inf), value, special)

@@ -161,8 +161,8 @@ def function(name: str, width: int, formula: Callable[..., Vector], arguments: i
     """Return the text of an internal function of vectors of doubles, and its declarations."""
     body = Body(width)
     double = body.type("double")
-    result = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))
+    value = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))
     lines = "".join(f"  {line}\n" for line in body.lines)
     signature = ", ".join(f"{double} %x{i}" for i in range(arguments))
-    text = f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {result.name}\n}}\n"
+    text = f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {value.name}\n}}\n"
     return text, body.declared

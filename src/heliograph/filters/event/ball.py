@@ -12,7 +12,7 @@ from heliograph.numerics.linalg import eigh
 
 MOST_COMPONENTS = 3  # nodes are a grid over all but one of them
 REACH = 9.0  # deviations from the centre beyond which there is no probability that counts
-NODES, WEIGHTS = (part / 2 for part in np.polynomial.legendre.leggauss(32))
+NODES, WEIGHTS = (array / 2 for array in np.polynomial.legendre.leggauss(32))
 NODES = NODES + 0.5  # on (0, 1)
 
 

@@ -43,6 +43,15 @@ def event_filter(
     Claim: "exact" behind a `StochasticTrigger` without losses, or with losses that are known, and behind `Periodic`,
     where plant and sensor are linear and no gain is random; else "nominal".
 
+    Args:
+        plant: linear or not; it may vary over time.
+        sensor: whose components are sent.
+        channel: link of the sender, with its losses.
+        trigger: rule by which the sender sends.
+        known: number of Gaussians where the reference is the value that came last (default 3).
+        lost: number of Gaussians where it may be a value that was lost (default 2).
+        transform: of moments, for a plant or sensor that is not linear (default `Cubature()`).
+
     Raises:
         ValueError: parts that do not fit, angles, a link whose memory drifts or whose delays are not 0, several
             components that are each sent alone through links that are not lost one by one.
@@ -106,7 +115,7 @@ def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray
     drifting = [memory for memory in memories(first(channel)).values() if not isinstance(memory, MarkovChain)]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
-    steps = [joint_modes(item) for item in unstack(channel)]
+    steps = [joint_modes(step) for step in unstack(channel)]
     parts = by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
 
@@ -120,8 +129,8 @@ def _alike(channel: SideInformation) -> bool:
     """True if what arrives has the same law in all modes in which it can."""
     possible = np.asarray(channel.chance) > 0
     return all(
-        np.array_equal(part[rows, a], np.broadcast_to(part[rows, a][:1], part[rows, a].shape))
-        for part in (np.asarray(channel.mean), np.asarray(channel.spread))
+        np.array_equal(moment[rows, a], np.broadcast_to(moment[rows, a][:1], moment[rows, a].shape))
+        for moment in (np.asarray(channel.mean), np.asarray(channel.spread))
         for a, rows in enumerate(possible.T)
         if channel.present[a].any() and rows.any()
     )

@@ -16,6 +16,7 @@ from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -100,15 +101,15 @@ class EventFilter(AbstractSizedFilter):
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), (self.trigger.heartbeat or 0) + 1, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        item = Parts(jnp.zeros(1), mean[None], covariance[None], label[None])
+        gaussian = Parts(jnp.zeros(1), mean[None], covariance[None], label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._alone(item), begun, jnp.asarray(False))
+        return EventBelief.of(self._alone(gaussian), begun, jnp.asarray(False))
 
-    def _alone(self, item: Parts) -> Parts:
+    def _alone(self, gaussian: Parts) -> Parts:
         """One Gaussian in a sum of which all others have no weight."""
         count = self._known_slots + (self.lost if self.follows else 0)
-        every = Parts(*(jnp.repeat(leaf, count, axis=0) for leaf in item))
-        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, item.log_weight[0], -jnp.inf))
+        every = Parts(*(jnp.repeat(leaf, count, axis=0) for leaf in gaussian))
+        return every._replace(log_weight=jnp.where(jnp.arange(count) == 0, gaussian.log_weight[0], -jnp.inf))
 
     @property
     def _known_slots(self) -> int:
@@ -144,9 +145,7 @@ class EventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        plant, sensor = at(self.plant, k), at(self.sensor, k)
-        x = plant.transition(mean, jnp.asarray(u)) + plant.noise_mean()
-        return jnp.asarray(sensor.measure(x) + sensor.noise.mean)
+        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: EventBelief, z: ArrayLike, k: Step = 0) -> tuple[EventBelief, Innovation]:
@@ -182,12 +181,12 @@ class EventFilter(AbstractSizedFilter):
         def came(wide: Parts) -> tuple[Parts, jax.Array, jax.Array]:
             return self._came(wide, channel, z, lost, s, begun)
 
-        result: tuple[Parts, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
-        return result
+        used: tuple[Parts, jax.Array, jax.Array] = jax.lax.cond(jnp.any(~jnp.isnan(z)), came, silent, wide)
+        return used
 
     def _silent(self, wide: Parts, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array) -> Parts:
         """Nothing came: not sent, or sent and lost."""
-        n, m, local = len(self.states), self.outputs, self.senders[s]
+        n, m, sender = len(self.states), self.outputs, self.senders[s]
         as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
         waiting, due = self._by_age(label, begun)
         loss = self._loss(channel, s)[:, None, None]
@@ -195,26 +194,26 @@ class EventFilter(AbstractSizedFilter):
         dropped, forced = (wide.labelled(s, _sent(which * loss, True)) for which in (waiting, due))
         if self.trigger.losses == "known":
             unsent = unsent.times(jnp.where(lost > 0, -jnp.inf, 0.0))
-            dropped, forced = (part.times(jnp.where(lost > 0, 0.0, -jnp.inf)) for part in (dropped, forced))
+            dropped, forced = (hypothesis.times(jnp.where(lost > 0, 0.0, -jnp.inf)) for hypothesis in (dropped, forced))
         edges = np.linspace(-1.0, 1.0, self.known + 1)
         bins = list(pairwise(edges))
 
         # Known reference: every Gaussian cut to each part of the line, and joined part by part.
         if not self.follows:
             every = together([unsent, forced]) if self.loses else unsent
-            slots = [join(self._inside(every, local, part)) for part in bins]
+            slots = [join(self._inside(every, sender, interval)) for interval in bins]
             every = together([dropped, forced])
-            slots += [join(piece) for piece in self._outside_of(every, local, 1.0)] if self.loses else []
+            slots += [join(piece) for piece in self._outside_of(every, sender, 1.0)] if self.loses else []
             return self._or_nothing(together(slots).keep(as_it_was), wide)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
         split = Parts(*(leaf[: self.known] for leaf in unsent)), Parts(*(leaf[self.known :] for leaf in unsent))
-        slots = [join(self._inside(split[0], local, part)) for part in bins]
-        others = self._inside(split[1], local, (-1.0, 1.0)).keep(as_it_was)
+        slots = [join(self._inside(split[0], sender, interval)) for interval in bins]
+        others = self._inside(split[1], sender, (-1.0, 1.0)).keep(as_it_was)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
-        renewed = self._renewed(local)
-        fresh = [join(piece.keep(renewed)) for piece in [*self._outside_of(dropped, local, 1.0), forced]]
-        few = reduced(together([others, *fresh]), self.lost, slice(n + local.start, n + local.stop))
+        renewed = self._renewed(sender)
+        fresh = [join(piece.keep(renewed)) for piece in [*self._outside_of(dropped, sender, 1.0), forced]]
+        few = reduced(together([others, *fresh]), self.lost, slice(n + sender.start, n + sender.stop))
         return self._or_nothing(together([*(slot.keep(as_it_was) for slot in slots), few]), wide)
 
     def _came(
@@ -222,7 +221,7 @@ class EventFilter(AbstractSizedFilter):
     ) -> tuple[Parts, jax.Array, jax.Array]:
         """A value came: a Kalman update of each Gaussian, weighed by its density and by why it was sent."""
         # Probability that this pattern of values arrives, by mode.
-        local, there = self.senders[s], ~jnp.isnan(z)
+        sender, there = self.senders[s], ~jnp.isnan(z)
         pattern = there if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
         chance = jnp.asarray(channel.chance)[:, kind]
@@ -238,17 +237,17 @@ class EventFilter(AbstractSizedFilter):
             mode = jnp.argmax(chance > 0) if self.alike else j
             link = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
             prior = wide.labelled(s, only)
-            pieces += self._selected(updated(prior, z, there, *link, local, self.outputs, self.delivers), s, begun)
+            pieces += self._selected(updated(prior, z, there, *link, sender, self.outputs, self.delivers), s, begun)
             # What was to be expected of a value that comes: y where the sender had to send.
             sent = join(together(self._selected(prior, s, begun)))
             signals.append(
-                sent._replace(label=jnp.zeros((1, 1)))._replace(**arriving(sent, *link, local, self.outputs))
+                sent._replace(label=jnp.zeros((1, 1)))._replace(**arriving(sent, *link, sender, self.outputs))
             )
         # One sum again, with a new reference.
-        item = join(together(pieces).keep(self._renewed(local)))
-        item = item.labelled(s, _sent(item.label[:, s], False))
+        whole = join(together(pieces).keep(self._renewed(sender)))
+        whole = whole.labelled(s, _sent(whole.label[:, s], False))
         signal = join(together(signals))
-        return self._alone(item), signal.mean[0], signal.covariance[0]
+        return self._alone(whole), signal.mean[0], signal.covariance[0]
 
     def _selected(self, used: Parts, s: int, begun: jax.Array) -> list[Parts]:
         """Each Gaussian where its sender had to send: outside the region, or anywhere if it was due."""
@@ -272,43 +271,43 @@ class EventFilter(AbstractSizedFilter):
         lost = ~jnp.any(jnp.asarray(channel.present)[:, mine], axis=1)
         return jnp.asarray(channel.chance) @ lost.astype(float)
 
-    def _renewed(self, local: slice) -> np.ndarray:
+    def _renewed(self, sender: slice) -> np.ndarray:
         """Places of (x, r) with what the sender transmits as its new reference, in (x, r, y)."""
         n, m = len(self.states), self.outputs
         places: np.ndarray = np.r_[0 : n + m]
         if self.trigger.needs_reference:
-            places[n + local.start : n + local.stop] = n + m + np.r_[local]
+            places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
         return places
 
-    def _errors(self, local: slice) -> list[tuple[jax.Array, jax.Array]]:
+    def _errors(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
         """Direction of y - r in (x, r, y), and delta, of each component of a sender."""
         n, m = len(self.states), self.outputs
         delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
         unit = jnp.eye(n + 2 * m)
-        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(local.start, local.stop)]
+        return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
 
-    def _inside(self, parts: Parts, local: slice, part: tuple[float, float]) -> Parts:
-        """Cut to the region; its first component to a part of the interval, in units of delta."""
-        for i, (direction, delta) in enumerate(self._errors(local)):
-            low, high = part if i == 0 else (-1.0, 1.0)
-            if not self.ball or (i == 0 and part != (-1.0, 1.0)):
+    def _inside(self, parts: Parts, sender: slice, interval: tuple[float, float]) -> Parts:
+        """Cut to the region; its first component to an interval, in units of delta."""
+        for i, (direction, delta) in enumerate(self._errors(sender)):
+            low, high = interval if i == 0 else (-1.0, 1.0)
+            if not self.ball or (i == 0 and interval != (-1.0, 1.0)):
                 parts = cut(parts, direction, low * delta, high * delta)
-        return self._cut_to_ball(parts, local, 1.0, True) if self.ball else parts
+        return self._cut_to_ball(parts, sender, 1.0, True) if self.ball else parts
 
-    def _outside_of(self, parts: Parts, local: slice, scale: float) -> list[Parts]:
+    def _outside_of(self, parts: Parts, sender: slice, scale: float) -> list[Parts]:
         """Cut to what is outside: the first component that is, above or below, those before it inside.
 
         Of a ball these are the parts outside of the box around it, and what the ball leaves of the box.
         """
-        results = []
-        for direction, delta in self._errors(local):
+        outside = []
+        for direction, delta in self._errors(sender):
             edge = scale * delta
-            results += [cut(parts, direction, edge, jnp.inf), cut(parts, direction, -jnp.inf, -edge)]
+            outside += [cut(parts, direction, edge, jnp.inf), cut(parts, direction, -jnp.inf, -edge)]
             parts = cut(parts, direction, -edge, edge)
-        return [*results, self._cut_to_ball(parts, local, scale, False)] if self.ball else results
+        return [*outside, self._cut_to_ball(parts, sender, scale, False)] if self.ball else outside
 
-    def _cut_to_ball(self, parts: Parts, local: slice, scale: float, inside: bool) -> Parts:
-        directions, deltas = zip(*self._errors(local), strict=True)
+    def _cut_to_ball(self, parts: Parts, sender: slice, scale: float, inside: bool) -> Parts:
+        directions, deltas = zip(*self._errors(sender), strict=True)
         return cut_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
 
     def _or_nothing(self, parts: Parts, before: Parts) -> Parts:

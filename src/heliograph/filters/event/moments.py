@@ -57,12 +57,12 @@ def updated(
     there: jax.Array,
     mean: jax.Array,
     tensor: jax.Array,
-    local: slice,
+    sender: slice,
     m: int,
     delivers: bool,
 ) -> Parts:
     """Each Gaussian of (x, r, y) given z = G y + n, weighed by its density."""
-    y, rows = slice(parts.mean.shape[1] - m, parts.mean.shape[1]), _rows(local, m)
+    y, rows = slice(parts.mean.shape[1] - m, parts.mean.shape[1]), _rows(sender, m)
     gain, both = mean[rows, :-1], there[:, None] & there
 
     # A Kalman update of each Gaussian, on the components that are there.
@@ -76,15 +76,15 @@ def updated(
 
     centre, covariance, density = jax.vmap(single)(parts.mean, parts.covariance)
     if delivers:  # y is z, to the last digit
-        places = np.r_[y][local]
+        places = np.r_[y][sender]
         centre = centre.at[:, places].set(jnp.where(there, z, 0.0))
         covariance = covariance.at[:, places].set(0.0).at[:, :, places].set(0.0)
     return Parts(parts.log_weight + density, centre, covariance, parts.label)
 
 
-def arriving(parts: Parts, mean: jax.Array, tensor: jax.Array, local: slice, m: int) -> dict[str, jax.Array]:
+def arriving(parts: Parts, mean: jax.Array, tensor: jax.Array, sender: slice, m: int) -> dict[str, jax.Array]:
     """Mean and covariance of z = G y + n for each Gaussian of (x, r, y)."""
-    y, rows = slice(parts.mean.shape[1] - m, parts.mean.shape[1]), _rows(local, m)
+    y, rows = slice(parts.mean.shape[1] - m, parts.mean.shape[1]), _rows(sender, m)
 
     def single(centre: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _through(centre[y], covariance[y, y], mean[rows], tensor[rows, rows])
@@ -93,9 +93,9 @@ def arriving(parts: Parts, mean: jax.Array, tensor: jax.Array, local: slice, m: 
     return {"mean": middle, "covariance": total}
 
 
-def _rows(local: slice, m: int) -> slice:
+def _rows(sender: slice, m: int) -> slice:
     """Outputs of the link that carry a sender's components: all, unless each component has its own sender."""
-    return slice(None) if local == slice(0, m) else local
+    return slice(None) if sender == slice(0, m) else sender
 
 
 def _through(

@@ -139,9 +139,9 @@ def _one_fewer(parts: Parts, places: slice) -> Parts:
     # The two joined; the others keep their places.
     merged = join(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
 
-    def placed(local: jax.Array, new: jax.Array) -> jax.Array:
-        shape = (-1, *[1] * (local.ndim - 1))
-        moved = jnp.where(is_second.reshape(shape), local[-1:], local)
+    def placed(values: jax.Array, new: jax.Array) -> jax.Array:
+        shape = (-1, *[1] * (values.ndim - 1))
+        moved = jnp.where(is_second.reshape(shape), values[-1:], values)
         return jnp.where(is_first.reshape(shape), new, moved)[:-1]
 
-    return Parts(*(placed(part, new) for part, new in zip(parts, merged, strict=True)))
+    return Parts(*(placed(leaf, new) for leaf, new in zip(parts, merged, strict=True)))

@@ -18,6 +18,7 @@ from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive
 from heliograph.filters.modes.side_information import SideInformation, with_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
@@ -83,9 +84,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     def reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Prediction of y at step k that both ends compute, from the estimate after the step before and the input."""
-        plant, sensor = at(self.plant, k), at(self.sensor, k)
-        x = plant.transition(mean, jnp.asarray(u)) + plant.noise_mean()
-        return jnp.asarray(sensor.measure(x) + sensor.noise.mean)
+        return predicted_signal(at(self.plant, k), at(self.sensor, k), mean, u)
 
     @corrects
     def correct(self, state: StochasticBelief, z: ArrayLike, k: Step = 0) -> tuple[StochasticBelief, Innovation]:
@@ -100,8 +99,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         modes = len(state.law)
         size = initial_size(at(self.plant, 0))
         belief, sent = jax.tree.map(lambda leaf: jnp.stack([leaf] * modes), (prior, signal))
-        result, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
-        came = join(Parts(safe_log(weight), result.mean, result.covariance, jnp.eye(len(weight))[:, None]))
+        posteriors, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
+        came = join(Parts(safe_log(weight), posteriors.mean, posteriors.covariance, jnp.eye(len(weight))[:, None]))
 
         # Nothing: the link was down, and the prior stays; or the sender was silent.
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
@@ -111,7 +110,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             parts.append(_alone(jnp.zeros(()), prior, state.law).labelled(0, state.law[None] * lost))
         if len(down):
             up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [parts[0].times(up), *(part.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for part in parts[1:])]
+            parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
         nothing = join(together(parts))
 
         there = jnp.any(~jnp.isnan(values))
@@ -141,7 +140,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link where all of what was sent arrives."""
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
-            jnp.tensordot(whole, jnp.asarray(part), 2) / jnp.sum(whole) for part in (channel.mean, channel.spread)
+            jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
         )
         return gain[:, :-1], spread
 
@@ -212,5 +211,5 @@ class StochasticEventFilter(AbstractSizedFilter):
 
 
 def _alone(log_weight: jax.Array, belief: Belief, law: jax.Array) -> Parts:
-    mean, covariance, law = (jnp.asarray(part)[None] for part in (belief.mean, belief.covariance, law))
+    mean, covariance, law = (jnp.asarray(moment)[None] for moment in (belief.mean, belief.covariance, law))
     return Parts(log_weight[None], mean, covariance, law[None])

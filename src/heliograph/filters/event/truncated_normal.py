@@ -9,7 +9,7 @@ import numpy as np
 REACH = (
     74.0  # density beyond sqrt(t^2 + REACH), t the interval's point nearest 0, is exp(-REACH / 2) = 8e-17 of that at t
 )
-NODES, WEIGHTS = (part / 2 for part in np.polynomial.legendre.leggauss(40))
+NODES, WEIGHTS = (array / 2 for array in np.polynomial.legendre.leggauss(40))
 NODES = NODES + 0.5  # on (0, 1)
 
 

@@ -83,14 +83,14 @@ class AdaptiveFilter(AbstractSizedFilter):
     def correct(self, state: AdaptiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdaptiveBelief, Innovation]:
         """Use what arrived of z for the state and for the variances."""
         # Moments of what arrives without its noise, and the noise's law.
-        item, belief, noise = self.base, Belief(state.mean, state.covariance), at(self.noise, k)
-        sensor, plant = at(item.sensor, k), at(item.plant, k)
-        signal = signal_without_noise(plant.angles, sensor, item.transform, belief)
-        before = expected_of(belief, signal, at(item.channel, k))
-        angles = item.received_angles if isinstance(item, RobustFilter) else item.observed_angles
+        base, belief, noise = self.base, Belief(state.mean, state.covariance), at(self.noise, k)
+        sensor, plant = at(base.sensor, k), at(base.plant, k)
+        signal = signal_without_noise(plant.angles, sensor, base.transform, belief)
+        before = expected_of(belief, signal, at(base.channel, k))
+        angles = base.received_angles if isinstance(base, RobustFilter) else base.observed_angles
         z = nearest(jnp.asarray(z), before.signal, angles)
-        rule = item.rule if isinstance(item, RobustFilter) else None
-        law = noise.law(signal.mean) if isinstance(item, RobustFilter) and rule is None else None
+        rule = base.rule if isinstance(base, RobustFilter) else None
+        law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _learn(
             before,
             state,
@@ -191,7 +191,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     Args:
         filter: a Gaussian filter (kalman_filter, extended_filter, cubature_filter, ...) or a robust one.
         memory: share of what was learned that a step leaves, over 0 and at most 1 (never forget); a variance is known
-            from some 1 / (1 - memory) values.
+            from some 1 / (1 - memory) values (default 0.98).
 
     Raises:
         ValueError: a filter that is neither Gaussian nor robust, correlated noise, a memory outside (0, 1].
@@ -211,7 +211,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
 
 def _noise_of(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """The sensor's noise as it arrives."""
-    steps = [part.steps for part in (filter.sensor, filter.channel) if isinstance(part, OverTime)]
+    steps = [model.steps for model in (filter.sensor, filter.channel) if isinstance(model, OverTime)]
     if not steps:
         return received_noise(at(filter.sensor, 0).noise, None, at(filter.channel, 0), True)
     return over_time(

@@ -196,12 +196,12 @@ def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
     return jnp.stack([jnp.any(jnp.stack(rows), axis=0) for rows in parts])
 
 
-def homogeneous(second: jax.Array, mean: jax.Array, item: float) -> jax.Array:
-    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `item` in the last corner."""
+def homogeneous(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
+    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
     column = mean[:, None]
     second = jnp.broadcast_to(second, (*second.shape[:2], *jnp.broadcast_shapes(second.shape[2:], mean.shape[1:])))
     column = jnp.broadcast_to(column, (*column.shape[:2], *second.shape[2:]))
-    corner = jnp.full_like(column[:1], item)
+    corner = jnp.full_like(column[:1], last)
     top = jnp.concatenate([second, column], axis=1)
     return jnp.concatenate([top, jnp.concatenate([transpose(column), corner], axis=1)])
 

@@ -50,8 +50,8 @@ def gain_spread(channel: SecondOrder | OverTime) -> np.ndarray | OverTime:
     # One set of operators per step, padded with zeros to the same number.
     if isinstance(channel, OverTime):
         parts = [np.asarray(gain_spread(step)) for step in unstack(channel)]
-        most = max(len(part) for part in parts)
-        return OverTime(np.stack([np.pad(part, [(0, most - len(part)), (0, 0), (0, 0)]) for part in parts]))
+        most = max(len(k) for k in parts)
+        return OverTime(np.stack([np.pad(k, [(0, most - len(k)), (0, 0), (0, 0)]) for k in parts]))
     if channel.uncertain:
         raise fail("single precision", "a channel whose probabilities are known", "uncertain ones")
     # Entries of H that vary, and how a pair's moment divides between (a, b) and (b, a).
@@ -133,12 +133,12 @@ class FactoredFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: FactoredBelief, z: ArrayLike, k: Step = 0) -> tuple[FactoredBelief, Innovation]:
         """Correct with the components of z that arrived."""
-        mean_gain, offset, spread = (at(part, k) for part in (self.mean_gain, self.offset, self.spread))
+        mean_gain, offset, spread = (at(moment, k) for moment in (self.mean_gain, self.offset, self.spread))
         sensor, (mean, factors) = at(self.sensor, k), state.estimate
         signal = self._signal(sensor, state.estimate)
         # The noise of z given the state: what is not linear, the sensor's, and the spread of the gain.
         of_signal = [*signal.curvature, columns_of(_known(sensor.noise.covariance))]
-        noise = [Columns(mean_gain @ part.matrix, part.weights) for part in of_signal]
+        noise = [Columns(mean_gain @ columns.matrix, columns.weights) for columns in of_signal]
         noise += self._spread(spread, sensor, state, signal, of_signal)
         # Slopes of z and its innovation, zero rows for what did not arrive.
         expected = mean_gain @ signal.mean + offset
@@ -201,8 +201,8 @@ class FactoredFilter(AbstractSizedFilter):
         y = jnp.concatenate([image.mean, jnp.ones(1)])
         parts = [Columns(image.slopes, known.factors.variances), *of_signal]
         columns = [Columns((spread @ y).T, np.ones(len(spread)))]
-        for part in parts:
-            columns += [Columns(spread[r, :, :-1] @ part.matrix, part.weights) for r in range(len(spread))]
+        for source in parts:
+            columns += [Columns(spread[r, :, :-1] @ source.matrix, source.weights) for r in range(len(spread))]
         return columns
 
 
@@ -233,9 +233,9 @@ def _used(mean: jax.Array, factors: Factors, rows: jax.Array, noise: jax.Array) 
     n, variances = len(mean), jnp.asarray(factors.variances)
     left, news = jnp.concatenate([factors.matrix(), rows[:, :-1]]), jnp.concatenate([mean, -rows[:, -1]])
     for i in range(len(rows)):
-        place = n + i
-        left, variances, gain = measured(left, variances, left[place], noise[i])
-        news = news - gain * news[place]
+        row = n + i
+        left, variances, gain = measured(left, variances, left[row], noise[i])
+        news = news - gain * news[row]
     return Moments(news[:n], Factors(left[np.tril_indices(n, -1)], variances))
 
 

@@ -44,8 +44,8 @@ class Factors(NamedTuple):
 
 def joined(parts: list[Columns]) -> Columns:
     """Sum of covariances: their columns one after another."""
-    matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
-    return Columns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+    matrix = jnp.concatenate([jnp.asarray(columns.matrix) for columns in parts], axis=1)
+    return Columns(matrix, jnp.concatenate([jnp.asarray(columns.weights) for columns in parts]))
 
 
 def sum_of(columns: Columns) -> jax.Array:
@@ -106,13 +106,13 @@ def measured(
     total, inverse, gain = noise, reciprocal(noise), jnp.zeros(len(rows))
     columns, after = [rows[:, 0]] * n, [noise] * n
     for j in reversed(range(n)):
-        part = variances[j] * f[j]
-        before, total = total, total + f[j] * part
+        product = variances[j] * f[j]
+        before, total = total, total + f[j] * product
         columns[j] = rows[:, j] - (f[j] * inverse) * gain
         inverse = reciprocal(total)
         # d_j+ = d_j s_{j+1} / s_j.
         after[j] = jnp.where(total > 0, variances[j] * (before * inverse), variances[j])
-        gain = gain + rows[:, j] * part
+        gain = gain + rows[:, j] * product
     return jnp.stack(columns, axis=1), jnp.stack(after), gain * inverse
 
 

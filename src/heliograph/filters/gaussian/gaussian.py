@@ -133,8 +133,8 @@ def _use(
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
     """Second moments of the channel in the form of the update, for each step where it varies."""
-    result: SecondOrder | OverTime = at_each_step(update.describe, channel)
-    return result
+    described: SecondOrder | OverTime = at_each_step(update.describe, channel)
+    return described
 
 
 def perfect_for(sensor: AnySensor) -> Channel:

@@ -163,10 +163,10 @@ class HasStart(Protocol):
     initial_covariance: Array
 
 
-def initial_size(item: HasStart) -> Float[jax.Array, " n"]:
+def initial_size(start: HasStart) -> Float[jax.Array, " n"]:
     """E[x_i^2] before the first step, (n,)."""
-    mean = jnp.asarray(item.initial_mean)
-    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(item.initial_covariance))
+    mean = jnp.asarray(start.initial_mean)
+    seconds: jax.Array = mean * mean + jnp.diagonal(jnp.asarray(start.initial_covariance))
     return seconds
 
 

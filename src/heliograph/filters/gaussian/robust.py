@@ -147,6 +147,15 @@ def robust_filter(
 
     Claim: "nominal"; in simulation the score update's covariance is right (NEES 0.95 to 1.05) where the law is true.
 
+    Args:
+        plant: linear or not; it may vary over time.
+        sensor: with the noise law whose outliers are weighed.
+        channel: between sensor and filter.
+        rule: weights by component (default: none, the score update).
+        transform: of moments, for a plant or sensor that is not linear (default `Cubature()`).
+        initial_mean: mean of x_0 (n,), by default the plant's.
+        initial_covariance: covariance of x_0 (n, n), by default the plant's.
+
     Raises:
         ValueError: parts that do not fit, components of the noise that are correlated (score and StudentVB) or mixed
             by the channel, no noise to weigh, StudentVB of another law than Student's.

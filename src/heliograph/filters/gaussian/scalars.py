@@ -83,9 +83,9 @@ def young_sweep(
     moved, known = trace(ws), trace(wm)
     by_first = [2 / beta[0] * inner(transpose(s), x) for x in (ws, wm)]  # d tr W X / d log beta_1
     by_second = [2 / beta[1] * inner(transpose(s), x) - 2 * beta[1] * inner(transpose(m), x) for x in (ws, wm)]
-    item, one_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
-    two, two_slopes = _root_ratio(moved, [by_first[0], by_second[0]], known, [by_first[1], by_second[1]])
-    return jnp.stack([item, two]), [one_slopes, two_slopes]
+    first, first_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
+    second, second_slopes = _root_ratio(moved, [by_first[0], by_second[0]], known, [by_first[1], by_second[1]])
+    return jnp.stack([first, second]), [first_slopes, second_slopes]
 
 
 def zero_mean_sweep(
@@ -107,15 +107,15 @@ def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> 
 
 
 def _root_ratio(
-    part: jax.Array, by_part: list[jax.Array], whole: jax.Array, by_whole: Sequence[jax.Array | None]
+    top: jax.Array, by_top: list[jax.Array], bottom: jax.Array, by_bottom: Sequence[jax.Array | None]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """log sqrt(part / whole), at least that of SMALLEST_SCALAR, also where nothing arrives and both are zero.
+    """Half of log(top / bottom), at least log SMALLEST_SCALAR, also where both are zero.
 
     Returned with its slopes, from those of both. No quotient or root of zero is taken, so that derivatives exist.
     """
-    some = (part > 0) & (whole > 0)
-    part, whole = jnp.where(some, part, 1.0), jnp.where(some, whole, 1.0)
-    value = jnp.log(part / whole) / 2
+    some = (top > 0) & (bottom > 0)
+    top, bottom = jnp.where(some, top, 1.0), jnp.where(some, bottom, 1.0)
+    value = jnp.log(top / bottom) / 2
     free = some & (value > np.log(SMALLEST_SCALAR))
-    slopes = [p / part if w is None else p / part - w / whole for p, w in zip(by_part, by_whole, strict=True)]
+    slopes = [p / top if w is None else p / top - w / bottom for p, w in zip(by_top, by_bottom, strict=True)]
     return jnp.where(free, value, np.log(SMALLEST_SCALAR)), [jnp.where(free, slope / 2, 0.0) for slope in slopes]

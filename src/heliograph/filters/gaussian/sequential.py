@@ -49,16 +49,16 @@ class SequentialFilter(AbstractSizedFilter):
         ):  # one correction compiled, run over the nodes
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
-            def correct(belief: Belief, item: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
-                single: GaussianFilter = eqx.combine(item[0], rest)
-                return single.correct(belief, item[1], k)
+            def correct(belief: Belief, node: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
+                single: GaussianFilter = eqx.combine(node[0], rest)
+                return single.correct(belief, node[1], k)
 
             state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
             return state, _joined([jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))])  # noqa: B023
         # Filters of different structure: one correction each.
-        ends, parts = np.cumsum([item.received for item in self.filters]), []
-        for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
-            state, single = item.correct(state, part, k)
+        ends, parts = np.cumsum([filter.received for filter in self.filters]), []
+        for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
+            state, single = filter.correct(state, received, k)
             parts.append(single)
         return state, _joined(parts)
 
@@ -74,9 +74,9 @@ class SequentialFilter(AbstractSizedFilter):
 
 
 def _joined(parts: Sequence[Innovation]) -> Innovation:
-    covariance = jax.scipy.linalg.block_diag(*(item.covariance for item in parts))
-    total = jnp.sum(jnp.stack([jnp.asarray(item.log_likelihood) for item in parts]))
-    return Innovation(jnp.concatenate([item.value for item in parts]), covariance, total)
+    covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
+    total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
+    return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
@@ -84,20 +84,23 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
 
     Claim: "exact" if every part is, else "nominal".
 
+    Args:
+        filters: one for each node, of one plant.
+
     Raises:
         ValueError: no filters, or filters of different state dimensions.
 
     Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
     """
-    parts = tuple(items("sequential filter", filters, "filters"))
-    for item in parts:
-        instance("sequential filter", item, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
+    nodes = tuple(items("sequential filter", filters, "filters"))
+    for filter in nodes:
+        instance("sequential filter", filter, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
     # All estimate the same plant; the claim is that of the weakest filter.
-    sizes = [(len(item.states), len(item.inputs)) for item in parts]
+    sizes = [(len(filter.states), len(filter.inputs)) for filter in nodes]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)
-    weakest_part = weakest([item.claim for item in parts])
+    weakest_claim = weakest([filter.claim for filter in nodes])
     return SequentialFilter(
-        filters=parts,
-        **sized("exact" if weakest_part == "exact" else "nominal", parts[0], sum(item.received for item in parts)),
+        filters=nodes,
+        **sized("exact" if weakest_claim == "exact" else "nominal", nodes[0], sum(filter.received for filter in nodes)),
     )

@@ -101,9 +101,9 @@ def unscented_filter(
         plant: the plant, n states.
         sensor: its sensor, m outputs.
         channel: from the sensor to the filter; by default all arrives as it is. The memory of a channel is ignored.
-        alpha: spread of the points, above 0.
-        beta: weight of the mean's curvature, 2 for a Gaussian state.
-        kappa: second spread; alpha^2 kappa + beta n may not be negative.
+        alpha: spread of the points, above 0 (default 0.001).
+        beta: weight of the mean's curvature, 2 for a Gaussian state (default 2).
+        kappa: second spread; alpha^2 kappa + beta n may not be negative (default 0).
         update: how an uncertain channel is bounded; `Polytope()` by default.
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.

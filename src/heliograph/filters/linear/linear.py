@@ -88,7 +88,7 @@ class LinearFilter(AbstractSizedFilter):
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         transition, shift, noise = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-        error, state_moments = (moved(*part, transition, shift, noise) for part in (state[:2], state[2:]))
+        error, state_moments = (moved(*pair, transition, shift, noise) for pair in (state[:2], state[2:]))
         return LinearBelief(*error, *within_range(*state_moments))
 
     @corrects

@@ -242,8 +242,8 @@ def _shape(leaf: Any) -> object:
 def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
     """Answer of `is_linear_filter` by structure and shapes, so that filters of one structure are traced once."""
     with jax.enable_x64(True):
-        item = jax.tree.unflatten(tree, leaves)
-        planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), item)
+        filter = jax.tree.unflatten(tree, leaves)
+        planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), filter)
     return isinstance(planned, PlannedFilter) and planned.projection is None
 
 

@@ -67,16 +67,16 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
 def without_mean(plant: AnyPlant) -> AnyPlant:
     """Return the plant of the centred state x_k - E[x_k]."""
     if isinstance(plant, OverTime):
-        return over_time([without_mean(item) for item in unstack(plant)])
+        return over_time([without_mean(step) for step in unstack(plant)])
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
     return LinearPlant(plant.matrix, about_mean(plant.noise), np.zeros(n), law, plant.input_matrix, plant.states)
 
 
-def _matrix(item: AbstractPlant | AbstractSensor) -> np.ndarray:
-    assert isinstance(item, LinearPlant | LinearSensor)  # checked before
-    return np.asarray(item.matrix)
+def _matrix(model: AbstractPlant | AbstractSensor) -> np.ndarray:
+    assert isinstance(model, LinearPlant | LinearSensor)  # checked before
+    return np.asarray(model.matrix)
 
 
 def _repeated(items: list[T], count: int) -> list[T]:

@@ -53,24 +53,24 @@ def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
         # z = g H y + n: every gain with every noise.
         case GainAndNoise():
             gains, noises = _gain_atoms(channel.law), _noise_atoms(channel.noise)
-            result = [Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises]
+            atoms = [Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises]
         # One map after another: G_2 (G_1 y + n_1) + n_2.
         case Series():
-            result = atoms_of(channel.maps[0])
-            for part in channel.maps[1:]:
-                result = _combine(result, atoms_of(part), _after)
+            atoms = atoms_of(channel.maps[0])
+            for affine in channel.maps[1:]:
+                atoms = _combine(atoms, atoms_of(affine), _after)
         # Maps of the same signal, stacked.
         case Stack():
-            result = atoms_of(channel.maps[0])
-            for part in channel.maps[1:]:
-                result = _combine(result, atoms_of(part), _others)
+            atoms = atoms_of(channel.maps[0])
+            for affine in channel.maps[1:]:
+                atoms = _combine(atoms, atoms_of(affine), _others)
         # One of several maps, drawn: p(i) times the atoms of map i.
         case Mixture():
             weighted = zip(channel.choice.probabilities, channel.maps, strict=True)
-            result = [c._replace(weight=p * c.weight) for p, part in weighted for c in atoms_of(part)]
+            atoms = [c._replace(weight=p * c.weight) for p, affine in weighted for c in atoms_of(affine)]
         case _:
             raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(channel).__name__)
-    return result
+    return atoms
 
 
 def _combine(
@@ -125,14 +125,14 @@ def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
             return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
         # Independent components: the product of their laws.
         case Independent():
-            result = [(1.0, np.zeros(0), np.zeros((0, 0)))]
-            for part in noise.parts:
-                more = _noise_atoms(part)
-                if len(result) * len(more) > COMPONENT_LIMIT:
-                    got = f"{len(result) * len(more):,}"
+            atoms = [(1.0, np.zeros(0), np.zeros((0, 0)))]
+            for component in noise.parts:
+                more = _noise_atoms(component)
+                if len(atoms) * len(more) > COMPONENT_LIMIT:
+                    got = f"{len(atoms) * len(more):,}"
                     raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", got)
-                result = [_joint(a, b) for a in result for b in more]
-            return result
+                atoms = [_joint(a, b) for a in atoms for b in more]
+            return atoms
         case _:
             raise fail("mixture filter", "noises of finite support or Gaussian", type(noise).__name__)
 
@@ -240,8 +240,8 @@ class MixtureFilter(AbstractSizedFilter):
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
         after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
-        result = MixtureBelief(mean + shift, after, modes, state.moved)
-        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
+        updated = MixtureBelief(mean + shift, after, modes, state.moved)
+        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @in_float64
     def estimate(self, state: MixtureBelief) -> Estimate:
@@ -300,7 +300,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         modes = [_modes(channel)]
         components: Components | OverTime = _components(sensor, modes[0], modes[0], floor)
     else:
-        steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
+        steps = min(model.steps for model in (sensor, channel) if isinstance(model, OverTime))
         sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
         modes = [_modes(c) for c in channels if isinstance(c, AbstractRandomAffine)]
         items = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)

@@ -94,8 +94,8 @@ class AbstractModalFilter(AbstractSizedFilter):
     def rounding(self, gains: jax.Array, random: jax.Array, k: Step) -> jax.Array:
         """Variance (m,) that rounding gives to z by what y is off and, by a hundred eps, to its random gains' noise."""
         of_z = received_rounding(at(self.sensor, k), initial_size(at(self.plant, 0)), gains)
-        result: jax.Array = of_z + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
-        return result
+        variance: jax.Array = of_z + 100 * float(np.finfo(random.dtype).eps) * jnp.diagonal(random)
+        return variance
 
     def _projection(self) -> Float[np.ndarray, "n N"]:
         return sum_of_modes(len(self.states), len(self.initial))

@@ -107,8 +107,8 @@ class ModeObservedFilter(AbstractSizedFilter):
         after = jax.tree.map(lambda a, b: jnp.where(known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
-        for item in published:
-            flag_innovation, spread = with_flag(spread, item)
+        for mode in published:
+            flag_innovation, spread = with_flag(spread, mode)
             value = jnp.append(value, flag_innovation)
         belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
@@ -122,8 +122,8 @@ class ModeObservedFilter(AbstractSizedFilter):
 def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
     matrix, shift, noise = move
     pairs = ((belief.mean, belief.covariance), (belief.state_mean, belief.state_covariance))
-    error, local = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
-    return LinearBelief(*error, *within_range(*local))
+    error, state = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
+    return LinearBelief(*error, *within_range(*state))
 
 
 def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:

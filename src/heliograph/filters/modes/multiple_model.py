@@ -66,13 +66,13 @@ def receive(
         link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
         return corrected(separate, sent, link, Polytope(), z, size, angles)
 
-    result, received = jax.vmap(single)(belief, signal, mean, spread)
+    posteriors, received = jax.vmap(single)(belief, signal, mean, spread)
     # Posterior weights; beliefs stay as they are where no mode, or not this one, can produce such a value.
     weights, density, excluded = posterior_weights(prior, jnp.where(chance > 0, received.log_likelihood, -jnp.inf))
     possible = (chance > 0) & ~excluded  # a mode in which this cannot arrive has no map for it
     after = Belief(
-        jnp.where(possible[:, None], result.mean, belief.mean),
-        jnp.where(possible[:, None, None], result.covariance, belief.covariance),
+        jnp.where(possible[:, None], posteriors.mean, belief.mean),
+        jnp.where(possible[:, None, None], posteriors.covariance, belief.covariance),
     )
     value = nearest(jnp.asarray(received.value), received.value[jnp.argmax(prior)], angles)
     return after, weights, mixed_innovation(prior, value, received.covariance, density)
@@ -83,8 +83,8 @@ def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], Si
     steps = [joint_modes(c, nodes) for c in unstack(channel)]
     no_flags = np.ones((len(steps[0].initial), 1))
     parts = by_pattern(steps, no_flags)
-    for part in parts if len(no_flags) > 1 else []:
-        _check_random(part)
+    for step in parts if len(no_flags) > 1 else []:
+        _check_random(step)
     return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
 
 
@@ -129,7 +129,7 @@ class MergeAll(AbstractMerging):
         """Replace every component by the whole mixture."""
         law = jnp.sum(state.weight @ rows, axis=0)
         whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-        every = [jnp.repeat(part, len(rows), axis=0) for part in whole]
+        every = [jnp.repeat(moment, len(rows), axis=0) for moment in whole]
         return state._replace(mean=every[0], covariance=every[1], weight=jnp.diag(law))
 
 
@@ -199,7 +199,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
-        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *moments: predicted(plant, self.transform, Belief(*moments), u))(*state[:2])
         mean = together(plant, mean, jnp.sum(state.weight, axis=1))
         return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
 
@@ -208,7 +208,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Correct each component in each mode with z, and weight them by their likelihood."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
-        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
+        signals = jax.vmap(lambda *moments: signal_of(plant, sensor, self.transform, Belief(*moments)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
         chance = state.weight[i, j]
@@ -231,8 +231,8 @@ class MultipleModelFilter(AbstractSizedFilter):
 
 def _whole(state: ModalBeliefs) -> Belief:
     """Mean and covariance of the whole mixture."""
-    result, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-    return Belief(result.mean[0], result.covariance[0])
+    whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+    return Belief(whole.mean[0], whole.covariance[0])
 
 
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:

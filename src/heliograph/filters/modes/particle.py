@@ -73,7 +73,7 @@ class ParticleFilter(AbstractSizedFilter):
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *moments: predicted(plant, self.transform, Belief(*moments), u))(*state[:2])
         mode = jnp.where(state.moved, drawn, state.mode)
         mean = together(plant, mean, state.weight)
         return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
@@ -84,7 +84,7 @@ class ParticleFilter(AbstractSizedFilter):
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
         size = initial_size(at(self.plant, 0))
-        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
+        signals = jax.vmap(lambda *moments: signal_of(plant, sensor, self.transform, Belief(*moments)))(*belief)
 
         after, weight, mixed = receive(
             belief, signals, channel, state.mode, state.weight, z, size, self.observed_angles
@@ -105,9 +105,9 @@ class ParticleFilter(AbstractSizedFilter):
         return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
 
 
-def _chosen(law: jax.Array, place: jax.Array) -> jax.Array:
+def _chosen(law: jax.Array, uniform: jax.Array) -> jax.Array:
     """Invert the distribution function."""
-    return jnp.searchsorted(jnp.cumsum(law)[:-1], place)
+    return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform)
 
 
 def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
@@ -118,8 +118,8 @@ def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
 def _folded(key: jax.Array, z: jax.Array) -> jax.Array:
     """Key made of another one and of the bits of a measurement."""
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
-    for part in bits.ravel():
-        key = jax.random.fold_in(key, part)
+    for word in bits.ravel():
+        key = jax.random.fold_in(key, word)
     return key
 
 

@@ -107,9 +107,9 @@ class SideInformationFilter(AbstractSizedFilter):
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         square = padded(jnp.asarray(start.initial_covariance)).at[-1, -1].set(1.0)
-        item = jnp.zeros(len(square)).at[-1].set(1.0)
-        expected = jnp.kron(law, item)
-        known = jnp.outer(expected, item)  # s = known x~
+        unit = jnp.zeros(len(square)).at[-1].set(1.0)
+        expected = jnp.kron(law, unit)
+        known = jnp.outer(expected, unit)  # s = known x~
         r = _stacked(jnp.eye(len(square)), known, _deviations(len(law), len(square)) - known)
         moments = law[:, None, None] * (r @ square @ r.swapaxes(1, 2))
         return SideInformationBelief(jnp.asarray(start.initial_mean), expected, moments, jnp.asarray(False))
@@ -322,20 +322,20 @@ def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> 
 
 
 def _side_information(
-    items: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
+    outcomes: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
 ) -> SideInformation:
-    m, p = items[0][0].map.outputs, items[0][0].map.inputs + 1
-    shape = (len(items), len(kinds))
+    m, p = outcomes[0][0].map.outputs, outcomes[0][0].map.inputs + 1
+    shape = (len(outcomes), len(kinds))
     # Sums over the outcomes of each mode: P, P E[(G, n)] and P E[(G, n) x (G, n)].
     chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
-    for j, parts in enumerate(items):
-        for part in parts:
-            a, (first_order, second_order) = kinds.index(tuple(part.arrived)), second_moments(part.map)
-            chance[j, a] += part.probability
-            mean[j, a] += part.probability * first_order
-            second[j, a] += part.probability * second_order
+    for j, of_mode in enumerate(outcomes):
+        for outcome in of_mode:
+            a, (first_order, second_order) = kinds.index(tuple(outcome.arrived)), second_moments(outcome.map)
+            chance[j, a] += outcome.probability
+            mean[j, a] += outcome.probability * first_order
+            second[j, a] += outcome.probability * second_order
     # Conditional moments given mode and pattern.
     divisor = np.where(chance > 0, chance, 1.0)
     mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
-    spread = second - np.array([[symmetric_product(item, item) for item in row] for row in mean])
+    spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
     return SideInformation(before.transition, np.array(kinds).reshape(len(kinds), m), chance, mean, spread, flags)

@@ -123,8 +123,8 @@ class UncertainModalFilter(AbstractModalFilter):
         return replace(moments, projection=jnp.asarray(self._projection()))
 
 
-def _ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
-    return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)
+def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 
 def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:

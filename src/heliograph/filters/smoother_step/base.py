@@ -112,12 +112,12 @@ class AbstractSmootherStep(Module):
         """Return an earlier state given this step's data too; the filter had this covariance before the step."""
         raise NotImplementedError
 
-    def before(self, item: "AbstractSmootherStep", earlier: PyTree, known: Moments) -> Moments:
-        """Return the state after step `item`, the one before this, given all later data.
+    def before(self, previous: "AbstractSmootherStep", earlier: PyTree, known: Moments) -> Moments:
+        """Return the state after step `previous`, the one before this, given all later data.
 
         `earlier` is the result of `back`; `known` is the state after this step given the same data.
         """
-        return item.smoothed(earlier)
+        return previous.smoothed(earlier)
 
     def start(self) -> Point:
         """Return the state after this step as a point to be carried ahead."""
@@ -129,9 +129,9 @@ class AbstractSmootherStep(Module):
         """Return the same step with other data of the same arrivals: other means and innovation."""
         return replace(self, mean=mean, prior_mean=prior_mean)
 
-    def estimate_from(self, result: Moments | Point) -> Estimate:
+    def estimate_from(self, moments: Moments | Point) -> Estimate:
         """Estimate of the plant's state from the filter's."""
-        mean, covariance = result.mean, result.covariance
+        mean, covariance = moments.mean, moments.covariance
         if self.projection is not None:
             mean, covariance = applied(self.projection, mean), _congruence(self.projection, covariance)
         mean = mean if self.shift is None else mean + self.shift
@@ -225,14 +225,14 @@ class LinearSmootherStep(AbstractSmootherStep):
         mean, after = (jnp.where(precise, a, b) for a, b in zip(squares, adjoint, strict=True))
         return Point(mean, after, link, apart, cross, precise)
 
-    def before(self, item: AbstractSmootherStep, earlier: Adjoint, known: Moments) -> Moments:
+    def before(self, previous: AbstractSmootherStep, earlier: Adjoint, known: Moments) -> Moments:
         """Smooth by the adjoint or, where that has lost its digits, by J = P A' (P-)^+.
 
         x + J (x_s+ - x-) and P_s = (I - J A) P (I - J A)' + J (Q + P_s+) J', a sum of squares by Rauch, Tung and
         Striebel with P - J P- J' in Joseph's form; it needs one more inverse.
         """
-        step = item.covariance, self.transition, self.process, earlier.precise
-        mean = _mean_before(item.mean, earlier.vector, known.mean - self.prior_mean, *step)
+        step = previous.covariance, self.transition, self.process, earlier.precise
+        mean = _mean_before(previous.mean, earlier.vector, known.mean - self.prior_mean, *step)
         return Moments(mean, _left(earlier.matrix, known.covariance, *step))
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> Self:

@@ -110,8 +110,8 @@ class ClockFilter(AbstractSizedFilter):
     def _estimated(self, observed: jax.Array) -> jax.Array:
         """1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
         values = jnp.ones(len(self.states))
-        for i, place in enumerate(self.offsets):
-            values = values.at[place : place + 2].set(jnp.where(observed[i], 1.0, 0.0))
+        for i, offset in enumerate(self.offsets):
+            values = values.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
         return values
 
     def _observed(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
@@ -119,12 +119,12 @@ class ClockFilter(AbstractSizedFilter):
         slope = jax.jacfwd(observe)
         rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
         seen = self._alone(state, observe, k)
-        result = []
-        for i, place in enumerate(self.offsets):
-            variance = jnp.einsum("ri,ij,rj->r", curve[:, place], state.covariance, curve[:, place])
-            moves = jnp.any(rate[:, place] ** 2 > SIGNIFICANT * variance)
-            result.append(moves & (seen[i] > SHARE))
-        return jnp.stack(result)
+        observable = []
+        for i, offset in enumerate(self.offsets):
+            variance = jnp.einsum("ri,ij,rj->r", curve[:, offset], state.covariance, curve[:, offset])
+            moves = jnp.any(rate[:, offset] ** 2 > SIGNIFICANT * variance)
+            observable.append(moves & (seen[i] > SHARE))
+        return jnp.stack(observable)
 
     def _alone(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Share of the outputs' derivatives by each offset that is independent of those by the other states."""
@@ -136,8 +136,8 @@ class ClockFilter(AbstractSizedFilter):
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
             return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
-        _, parts = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
-        return jnp.stack([_share(jnp.sum(parts, axis=0), place) for place in self.offsets])
+        _, squares = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
+        return jnp.stack([_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
     @in_float64
     def estimate(self, state: ClockBelief) -> Estimate:
@@ -145,17 +145,17 @@ class ClockFilter(AbstractSizedFilter):
         return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
-def _share(square: jax.Array, place: int) -> jax.Array:
+def _share(square: jax.Array, column: int) -> jax.Array:
     """1 - r' R^+ r, the unexplained share of one column of O given the others, R their correlations, O'O = `square`."""
     size = jnp.sqrt(jnp.diagonal(square))
     scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
-    others = [i for i in range(square.shape[0]) if i != place]
-    among, local = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), place]
+    others = [i for i in range(square.shape[0]) if i != column]
+    among, r = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), column]
     values, vectors = eigh(among)
     used = values > RANK * values[-1]
-    known = jnp.sum(jnp.where(used, (vectors.T @ local) ** 2 / jnp.where(used, values, 1.0), 0.0))
-    return jnp.where(size[place] > 0, 1 - known, 0.0)
+    known = jnp.sum(jnp.where(used, (vectors.T @ r) ** 2 / jnp.where(used, values, 1.0), 0.0))
+    return jnp.where(size[column] > 0, 1 - known, 0.0)
 
 
 def _considered(prior: jax.Array, gain: jax.Array, signal: Signal, channel: SecondOrder, total: jax.Array) -> jax.Array:
@@ -196,8 +196,8 @@ def clock_filter(
     chosen = PolynomialMoments(2) if transform is None else transform
     base = gaussian_filter(plant, sensor, channel, chosen, Polytope())
     # Schmidt's update needs the moments of the channel themselves, not bounds.
-    described = jax.tree.leaves(base.channel, is_leaf=lambda part: isinstance(part, SecondOrder))
-    if any(isinstance(part, SecondOrder) and part.uncertain for part in described):
+    described = jax.tree.leaves(base.channel, is_leaf=lambda leaf: isinstance(leaf, SecondOrder))
+    if any(isinstance(leaf, SecondOrder) and leaf.uncertain for leaf in described):
         raise fail("channel of a clock filter", "known probabilities", "uncertain ones")
     return ClockFilter(
         base=base,

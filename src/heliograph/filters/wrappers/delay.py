@@ -132,12 +132,12 @@ class HeldFilter(AbstractPartFilter):
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
-    """Moments after r = G l + n stands at `place`, l the line of `length` from `start` on."""
+def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, position: int) -> PyTree:
+    """Moments after r = G l + n stands at `position`, l the line of `length` from `start` on."""
     # x+ = move x + shift: the received signal replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
-    here, there = slice(start, start + length), slice(place, place + m)
+    here, there = slice(start, start + length), slice(position, position + m)
     move, shift = jnp.eye(total).at[there, :].set(0.0).at[there, here].set(gain), jnp.zeros(total).at[there].set(offset)
     # Cov(r | l) at the unconditional moments of l.
     mean, covariance = state.state_mean[here], state.state_covariance[here, here]
@@ -294,7 +294,7 @@ class KnownDelayFilter(AbstractPartFilter):
         known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(known, delay, 0.0).astype(int), 0, longest)
         here = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
-        base = eqx.tree_at(lambda item: item.channel, self.base, here)
+        base = eqx.tree_at(lambda filter: filter.channel, self.base, here)
         after, innovation = base.correct(state, z, k)
         used = jax.tree.map(lambda new, old: jnp.where(known, new, old), after, state)
         flag_innovation, covariance = with_flag(innovation.covariance, delay)
@@ -330,11 +330,11 @@ def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
     larger, everything, _ = with_past(plant, sensor, channel)
-    items = [channel.given(d) for d in range(channel.past + 1)]
-    base, start = make(larger, everything, items[0]), first(plant)
+    links = [channel.given(d) for d in range(channel.past + 1)]
+    base, start = make(larger, everything, links[0]), first(plant)
     return KnownDelayFilter(
         base=base,
-        channels=stack([second_order(item) for item in items]),
+        channels=stack([second_order(link) for link in links]),
         **sized(base.claim, start, channel.outputs),
     )
 

@@ -11,6 +11,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaus
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.model.centred import predicted_signal
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters
@@ -69,6 +70,9 @@ def prediction_of(filter: AbstractFilter) -> PredictionFilter:
 
     Claim: that of `filter`, a `GaussianFilter`.
 
+    Args:
+        filter: whose prediction is the estimate.
+
     Raises:
         ValueError: a filter that is not Gaussian.
 
@@ -105,10 +109,7 @@ class FedBackFilter(AbstractSizedFilter):
 
     def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
         """Reference r subtracted from y at step k, from the estimate after step k - 1 and the input over step k."""
-        plant, sensor = at(self.base.plant, k), at(self.base.sensor, k)
-        expected = plant.transition(jnp.asarray(known), jnp.asarray(u)) + plant.noise_mean()
-        result: jax.Array = sensor.measure(expected) + sensor.noise.mean
-        return result
+        return predicted_signal(at(self.base.plant, k), at(self.base.sensor, k), known, u)
 
     @in_float64
     def init(self) -> FedBackBelief:

@@ -106,10 +106,3 @@ def information_of(
     r = there[:, None] * noise * there[None] + diagonal(1 - there)
     weighted = transpose(solve(r, h))
     return weighted, times(weighted, h)
-
-
-def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[jax.Array, "node degree n n"]:
-    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
-    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * jnp.eye(len(matrix))
-    others = (gains.front[:, None] @ parts).at[:, 0].set(0.0)
-    return others.at[:, 0].set(gains.innovation @ matrix - others.sum(axis=1))

@@ -122,7 +122,7 @@ def neighbours_within(
     reach = float(scalar("radius", radius, np.finfo(float).tiny))
     if not given:
         raise fail("positions", "those of some nodes", "none")
-    rows = [array(f"position of {name!r}", place, ("axes",)) for name, place in given.items()]
+    rows = [array(f"position of {name!r}", position, ("axes",)) for name, position in given.items()]
     if len({len(row) for row in rows}) > 1:
         raise fail("positions", "as many numbers for each node", sorted({len(row) for row in rows}))
     names = list(given)
@@ -137,8 +137,8 @@ def neighbours_within(
 
 def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> Graph:
     """Return the graph of these nodes by place; each of the neighbours is among them."""
-    place = {name: i for i, name in enumerate(nodes)}
-    rows = [[i, *(place[sender] for sender in neighbours[name])] for i, name in enumerate(nodes)]
+    index = {name: i for i, name in enumerate(nodes)}
+    rows = [[i, *(index[sender] for sender in neighbours[name])] for i, name in enumerate(nodes)]
     degree = max(map(len, rows))
     senders = np.array([row + row[:1] * (degree - len(row)) for row in rows])
     present = np.arange(degree) < np.array([len(row) for row in rows])[:, None]

@@ -95,16 +95,18 @@ class DiffusionWeights(_OfNeighbours):
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
         """Return the rule with its shares (degree, row) of the graph's rows, zero for the node itself."""
-        result = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
+        if unknown := sorted(set(self.given or {}) - set(graph.nodes)):
+            raise fail("diffusion shares", f"those of nodes of the fusion {list(graph.nodes)[:5]}", unknown)
+        shares = np.where(graph.present, 1.0 / graph.present.sum(axis=1, keepdims=True), 0.0)
         for i, senders in enumerate(graph.senders if self.given is not None else ()):
             name, *others = (graph.nodes[j] for j in senders[graph.present[i]])
             mine = (self.given or {}).get(name, {})
             if unknown := sorted(set(mine) - {name, *others}):
                 raise fail(f"diffusion shares of {name!r}", f"those of its neighbours {sorted(others)}", unknown)
-            result[i, 1 : 1 + len(others)] = [mine.get(other, 0.0) for other in others]
-        result[:, 0] = 0.0
+            shares[i, 1 : 1 + len(others)] = [mine.get(other, 0.0) for other in others]
+        shares[:, 0] = 0.0
         placed: DiffusionWeights = eqx.tree_at(
-            lambda r: (r.shares, r.given), self, (result.T, None), is_leaf=lambda leaf: leaf is None
+            lambda r: (r.shares, r.given), self, (shares.T, None), is_leaf=lambda leaf: leaf is None
         )
         return placed
 

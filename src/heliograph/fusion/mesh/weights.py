@@ -48,8 +48,8 @@ def arrived_weights_by_component(
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
 
-    def single(item: jax.Array) -> jax.Array:
-        return arrived_weights(item.reshape(degree, 1, degree, 1), present)[0, :, 0]
+    def single(block: jax.Array) -> jax.Array:
+        return arrived_weights(block.reshape(degree, 1, degree, 1), present)[0, :, 0]
 
     return jnp.einsum("ai,ab->aib", jax.vmap(single)(component), jnp.eye(n))
 

@@ -49,7 +49,7 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
     if len(nodes) == 1:
         return network.plant, nodes[0].sensor, _joint_channel(nodes[0].channel)
-    if any(isinstance(part, OverTime) for node in nodes for part in (node.sensor, node.channel)):
+    if any(isinstance(model, OverTime) for node in nodes for model in (node.sensor, node.channel)):
         raise fail("network to be learned", "one node, where its sensor or channel varies over time", len(nodes))
     sensors = {name: first(node.sensor) for name, node in zip(network.names, nodes, strict=True)}
     return network.plant, _joined(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
@@ -59,17 +59,17 @@ def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
     parts = [sensor for sensor in sensors.values() if isinstance(sensor, LinearSensor)]
     if len(parts) < len(sensors):
         return joint_sensor(sensors)
-    matrices = [part.matrix for part in parts]
-    outputs = [f"{name}_{output}" for name, part in zip(sensors, parts, strict=True) for output in part.outputs]
-    return LinearSensor(library(matrices).concatenate(matrices), Independent([part.noise for part in parts]), outputs)
+    matrices = [s.matrix for s in parts]
+    outputs = [f"{name}_{output}" for name, s in zip(sensors, parts, strict=True) for output in s.outputs]
+    return LinearSensor(library(matrices).concatenate(matrices), Independent([s.noise for s in parts]), outputs)
 
 
 def _joint_channel(channel: Channel) -> Channel:
     """Channel without observed losses, which leave rows out; with memory losses tell the modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
-    result: Channel = at_each_step(arrived, channel)
-    return result
+    complete: Channel = at_each_step(arrived, channel)
+    return complete
 
 
 Form = Literal["linear", "conditional", "truth"]
@@ -149,20 +149,20 @@ class Objective:
 
     def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m)."""
-        result: tuple[jax.Array, jax.Array] = over_rows(
+        innovations: tuple[jax.Array, jax.Array] = over_rows(
             self.filter(x), z, u, lambda state, innovation, k: (innovation.value, innovation.covariance)
         )
-        return result
+        return innovations
 
     def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
         """Errors of the estimates (steps, n), NaN where the truth is not known, and what is claimed (steps, n, n)."""
-        item, angles = self.filter(x), first(self.description.start.plant).angles
+        filter, angles = self.filter(x), first(self.description.start.plant).angles
 
         def claimed(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            estimate = item.estimate(state)
+            estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
-        mean, covariance = over_rows(item, z, u, claimed)
+        mean, covariance = over_rows(filter, z, u, claimed)
         return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
@@ -185,13 +185,13 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
 def forms_of(network: Network) -> list[Form]:
     """The forms that a network allows."""
     plant, sensor, channel = joint_world(network)
-    item = first(channel)
-    plain = not item.remembers and not item.past
+    link = first(channel)
+    plain = not link.remembers and not link.past
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
-        if item.past:
+        if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or has_known_gain(item) or not has_random_gain(item, second_order(item)):
+    if not plain or has_known_gain(link) or not has_random_gain(link, second_order(link)):
         return ["linear"]
     return ["linear", "conditional"]
 
@@ -213,8 +213,8 @@ def sole_filter(network: Network) -> AbstractFilter:
         ValueError: none, several, one of a part of the states, or one that claims no covariance.
     """
     nodes = list(network.nodes.values())
-    local = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
-    items = [*local.values(), *(fusion for fusion in network.fused.values() if isinstance(fusion, AbstractFilter))]
+    filters = nodes[0].filters if len(nodes) == 1 and isinstance(nodes[0], Node) else {}
+    items = [*filters.values(), *(fusion for fusion in network.fused.values() if isinstance(fusion, AbstractFilter))]
     if len(items) != 1 or items[0].states != network.states:
         expected = "one filter, of all that arrives, whose estimates are compared with them"
         raise fail("network to be learned by its true states", expected, len(items) or "none")
@@ -225,7 +225,7 @@ def sole_filter(network: Network) -> AbstractFilter:
 
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data) -> Evaluation:
     """Likelihood, scores and information at points: all side by side in native code, or one by one by XLA."""
-    data_rows = [part for part in (data.measurements, data.inputs, data.truth) if part is not None]
+    data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     count, copies = len(data.measurements), (len(x), 1, 1)
     runs = np.repeat(x, count, axis=0), *(np.tile(data_row, copies) for data_row in data_rows)
     with jax.enable_x64(True):
@@ -245,10 +245,10 @@ def one_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Arr
     With the true states e is the error of the estimates and S what they claim.
     """
 
-    def local(x: Array) -> tuple[jax.Array, jax.Array]:
+    def along(x: Array) -> tuple[jax.Array, jax.Array]:
         return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
 
-    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 1))(jnp.eye(len(x)))
+    (e, s), (de, ds) = jax.vmap(lambda axis: jax.jvp(along, (x,), (axis,)), out_axes=(None, 1))(jnp.eye(len(x)))
 
     def step(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         k, *innovation = row
@@ -299,7 +299,7 @@ def gathered(network: Network, recording: object, inputs: Any, free: int, truth:
     if not len(several):
         raise fail("recordings", "at least one", "none")
     # every run of every recording, then all filled up to the longest
-    parts = [part for i, item in enumerate(several) for part in _parts(network, item, _inputs_of(inputs, i, several))]
+    parts = [run for i, single in enumerate(several) for run in _parts(network, single, _inputs_of(inputs, i, several))]
     for z, _ in parts:
         network.check_horizon(len(z))
     longest = max(len(z) for z, _ in parts)
@@ -328,12 +328,12 @@ def _truths(network: Network, several: Sequence[object], truth: Any, steps: list
     Raises:
         ValueError: recordings without them, other shapes.
     """
-    held = [getattr(item, "truth", None) for item in several] if truth is True else truth
+    held = [getattr(single, "truth", None) for single in several] if truth is True else truth
     listed = held if isinstance(held, list | tuple) and len(held) == len(several) else [held]
-    if len(listed) != len(several) or any(item is None for item in listed):
+    if len(listed) != len(several) or any(single is None for single in listed):
         got = "none" if truth is True else f"{len(listed)} of them"
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
-    runs = [run for item in map(np.asarray, listed) for run in (item if item.ndim == 3 else [item])]
+    runs = [run for states in map(np.asarray, listed) for run in (states if states.ndim == 3 else [states])]
     if len(runs) != len(steps):
         raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
     return [array("truth", run, (count, len(network.states)), missing=True)
@@ -343,7 +343,7 @@ def _truths(network: Network, several: Sequence[object], truth: Any, steps: list
 def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
     held = getattr(recording, "measurements", recording)
-    local = getattr(recording, "inputs", None) if inputs is None else inputs
+    known = getattr(recording, "inputs", None) if inputs is None else inputs
     # measurements by node
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
@@ -361,9 +361,9 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
             measured = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
             columns.append(np.asarray(measured))
         steps, count = len(columns[0]), len(network.inputs)
-        if local is None and count:
+        if known is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0)) if local is None else rows("inputs", local, steps, count, missing=False)
+        u = np.zeros((steps, 0)) if known is None else rows("inputs", known, steps, count, missing=False)
         results.append((np.concatenate(columns, axis=1), np.asarray(u)))
     return results
 
@@ -371,7 +371,7 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
 def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
     """Runs of a simulation one by one; a recording is one."""
     if all(value.ndim == 3 for value in values):
-        return [list(item) for item in zip(*values, strict=True)]
+        return [list(run) for run in zip(*values, strict=True)]
     return [values]
 
 

@@ -65,14 +65,14 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
 def with_nodes(channel: Map, count: int) -> Map:
     """Channel with each gain's law as finitely many values."""
 
-    def is_law(item: object) -> bool:
-        return isinstance(item, AbstractLaw)
+    def is_law(leaf: object) -> bool:
+        return isinstance(leaf, AbstractLaw)
 
-    def chosen(item: object) -> object:
-        return law_nodes(item, count) if isinstance(item, AbstractLaw) and not isinstance(item, Constant) else item
+    def chosen(leaf: object) -> object:
+        return law_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and not isinstance(leaf, Constant) else leaf
 
-    result: Map = jax.tree.map(chosen, channel, is_leaf=is_law)
-    return result
+    discrete: Map = jax.tree.map(chosen, channel, is_leaf=is_law)
+    return discrete
 
 
 @cache
@@ -115,8 +115,8 @@ class Predictive(NamedTuple):
         values = self.pit[~np.isnan(self.pit)]
         if not len(values):
             raise fail("pits", "at least one measurement that arrived", "none")
-        result = kstest(values, "uniform")
-        return float(result.statistic), float(result.pvalue)
+        test = kstest(values, "uniform")
+        return float(test.statistic), float(test.pvalue)
 
 
 def predictive(
@@ -151,10 +151,10 @@ def predictive(
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
     received = arrived(channel)
-    item = cubature_filter(plant, sensor, received)
-    z = rows("measurements", measurements, None, item.received, missing=True)
-    u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(item.inputs), missing=False)
-    y, spread, near = expected_signals(item, z, u)
+    filter = cubature_filter(plant, sensor, received)
+    z = rows("measurements", measurements, None, filter.received, missing=True)
+    u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(filter.inputs), missing=False)
+    y, spread, near = expected_signals(filter, z, u)
     return of_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), Parts.of(received, nodes))
 
 
@@ -177,7 +177,7 @@ class Parts(tuple[Part, ...]):
     def of(channel: AbstractRandomAffine, nodes: int) -> "Parts":
         """Combinations of each part of a stack, of everything else as a whole."""
         parts = channel.maps if isinstance(channel, Stack) else (channel,)
-        return Parts(_part(atoms_of(with_nodes(part, nodes))) for part in parts)
+        return Parts(_part(atoms_of(with_nodes(affine, nodes))) for affine in parts)
 
 
 def _part(components: list[Component]) -> Part:
@@ -201,8 +201,8 @@ def expected_signals(
         return filter.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
     start = jax.tree.map(jnp.asarray, filter.init())
-    result: tuple[jax.Array, ...] = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return result[0], result[1], result[2]
+    signals: tuple[jax.Array, ...] = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return signals[0], signals[1], signals[2]
 
 
 def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
@@ -216,9 +216,9 @@ def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts
 
 def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
     total, pits, start = np.zeros(len(z)), [], 0
-    for i, part in enumerate(parts):
-        stop = start + part.gain.shape[1]
-        weight, error, root = _weighed(y, spread, z[:, start:stop], part)
+    for i, law in enumerate(parts):
+        stop = start + law.gain.shape[1]
+        weight, error, root = _weighed(y, spread, z[:, start:stop], law)
         for j in range(stop - start):
             now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
             pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
@@ -226,41 +226,35 @@ def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tu
         total += last
         if i + 1 < len(parts):
             y, spread = _corrected(
-                y, spread, z[:, start:stop], part, np.exp(weight[..., -1] - last[:, None]), error, root
+                y, spread, z[:, start:stop], law, np.exp(weight[..., -1] - last[:, None]), error, root
             )
         start = stop
     return total, np.stack(pits, axis=1)
 
 
-def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
     there = ~np.isnan(z)[:, None]
     both = there[..., None] & there[..., None, :]
-    total = np.einsum("amp,tpq,anq->tamn", part.gain, spread, part.gain) + part.noise
+    total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
     total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
     root = np.linalg.cholesky(total)
-    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", part.gain, y) - part.offset, 0.0)
+    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     error = np.linalg.solve(root, value[..., None])[..., 0]
     scale = np.diagonal(root, axis1=-2, axis2=-1)
     density = np.where(there, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
-    weight = part.log_weight[:, None] + np.concatenate(
+    weight = law.log_weight[:, None] + np.concatenate(
         [np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2
     )
     return weight, error, root
 
 
 def _corrected(
-    y: np.ndarray,
-    spread: np.ndarray,
-    z: np.ndarray,
-    part: Part,
-    weight: np.ndarray,
-    error: np.ndarray,
-    root: np.ndarray,
+    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: Part, weight: np.ndarray, error: np.ndarray, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moments of the signal given this part too: those of the mixture over its combinations, weight (t, a)."""
+    """Moments of the signal given these components too: those of the mixture over its combinations, weight (t, a)."""
     there = ~np.isnan(z)[:, None, :, None]
-    cross = np.where(there, np.einsum("amp,tpq->tamq", part.gain, spread), 0.0)
+    cross = np.where(there, np.einsum("amp,tpq->tamq", law.gain, spread), 0.0)
     white = np.linalg.solve(root, cross)  # L^-1 G P
     moved = np.einsum("tamq,tam->taq", white, error)
     shift = np.einsum("ta,taq->tq", weight, moved)

@@ -40,8 +40,8 @@ class Surface:
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
         """Likelihood, gradient and information at points."""
-        result = self.evaluations(x)
-        return result.total, result.gradient, result.information
+        evaluation = self.evaluations(x)
+        return evaluation.total, evaluation.gradient, evaluation.information
 
     def climb(
         self, start: Float[np.ndarray, "points p"], active: Bool[np.ndarray, "points p"], watch: Watch
@@ -67,25 +67,25 @@ class Surface:
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
         """Hessian of -l by central differences of the scores of active coordinates; the information for the others."""
         information: np.ndarray = self.evaluations(x[None]).information[0]
-        local = np.diag(information)
-        width = np.where(local > 0, DIFFERENCE / np.sqrt(np.where(local > 0, local, 1.0)), 0.0)
-        moving = np.flatnonzero(active & (local > 0))
+        diagonal = np.diag(information)
+        width = np.where(diagonal > 0, DIFFERENCE / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
+        moving = np.flatnonzero(active & (diagonal > 0))
         shifts = np.zeros((len(moving), len(x)))
         shifts[np.arange(len(moving)), moving] = width[moving]
         if not len(moving):
             return information
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
-        result: np.ndarray = information.copy()
+        hessian: np.ndarray = information.copy()
         slopes = -(gradient[: len(moving)] - gradient[len(moving) :]) / (2 * width[moving][:, None])
         block = slopes[:, moving]
-        result[np.ix_(moving, moving)] = (block + block.T) / 2
-        return result
+        hessian[np.ix_(moving, moving)] = (block + block.T) / 2
+        return hessian
 
     def crossing(
         self,
         x: Float[np.ndarray, " p"],
         top: float,
-        place: int,
+        coordinate: int,
         reach: Float[np.ndarray, " points"],
         drop: float,
         active: Bool[np.ndarray, " p"],
@@ -95,13 +95,13 @@ class Surface:
         `reach`: values of the coordinate, away from its best, to begin with. Infinite where it has not fallen there.
         """
         others = active.copy()
-        others[place] = False
-        inside, outside = x[place], np.nan
+        others[coordinate] = False
+        inside, outside = x[coordinate], np.nan
         low = 0.0
         # profile at a few values, then again between the two around the crossing
         for _ in range(1 + REFINEMENTS):
             start = np.repeat(x[None], len(reach), axis=0)
-            start[:, place] = reach
+            start[:, coordinate] = reach
             total = maximise(self.evaluate, start, np.repeat(others[None], len(reach), axis=0)).total
             fallen = np.sqrt(np.maximum(2 * (top - np.where(np.isfinite(total), total, -np.inf)), 0.0))
             beyond = np.flatnonzero(fallen >= np.sqrt(2 * drop))

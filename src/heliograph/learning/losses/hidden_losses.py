@@ -59,16 +59,16 @@ class HiddenModeLosses(AbstractLossLaw):
         good, bad, fails, recovers = (share.estimate for share in self.shares().values())
         away = fails + recovers
         is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
-        result = np.zeros(len(fate))
+        probabilities = np.zeros(len(fate))
         for k, seen in enumerate(fate.tolist()):
             p = (1 - is_bad) * good + is_bad * bad
-            result[k] = p
+            probabilities[k] = p
             if seen == 1 and p > 0:
                 is_bad = is_bad * bad / p
             elif seen == 0 and p < 1:
                 is_bad = is_bad * (1 - bad) / (1 - p)
             is_bad = (1 - is_bad) * fails + is_bad * (1 - recovers)
-        return result
+        return probabilities
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Link in two modes (`gilbert_elliott`) with the losses of each."""
@@ -86,7 +86,7 @@ class Runs:
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
         self.kind = kind
-        items = {int(item): kind == item for item in np.unique(kind)}
+        items = {int(fate): kind == fate for fate in np.unique(kind)}
         self.places = {name: (here, *np.unique(length[here], return_inverse=True)) for name, here in items.items()}
 
     @staticmethod
@@ -106,22 +106,22 @@ class Runs:
     def _log(self, shares: np.ndarray) -> np.ndarray:
         """Log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
-        item = np.ones_like(good)
+        ones = np.ones_like(good)
         # T' and A of each fate, and the stationary law p
         moved = _matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
-        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [item, item]}
+        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
         away = fails + recovers
         start = _matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
         parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
         scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
         # (T' A)^length of each run, and their product
-        for kind, (here, lengths, place) in self.places.items():
+        for kind, (here, lengths, position) in self.places.items():
             if kind == START:
                 parts[:, here] = start[:, None]
                 continue
             step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
             power, scale = _powers(step, lengths)
-            parts[:, here], scales[:, here] = power[:, place], scale[:, place]
+            parts[:, here], scales[:, here] = power[:, position], scale[:, position]
         whole, scale = _product(parts)
         ahead = whole.sum(axis=-2)[..., 0]  # all columns of what starts with p 1' agree
         return np.asarray(np.log(ahead) + scale + scales.sum(axis=1))
@@ -142,18 +142,18 @@ def _scaled(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scaled matrix^length for each length, and the logarithms of the scales: by the binary digits of the lengths."""
     shape = (len(matrix), len(lengths))
-    result = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
+    power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
     scale, (square, square_scale) = np.zeros(shape), _scaled(matrix)
     left = lengths.copy()
     while np.any(left):
         odd = (left & 1).astype(bool)
-        result = np.where(odd[:, None, None], square[:, None] @ result, result)
-        result, more = _scaled(result)
+        power = np.where(odd[:, None, None], square[:, None] @ power, power)
+        power, more = _scaled(power)
         scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
         left = left >> 1
         square, more = _scaled(square @ square)
         square_scale = 2 * square_scale + more
-    return result, scale
+    return power, scale
 
 
 def _product(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

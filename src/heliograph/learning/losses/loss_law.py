@@ -49,10 +49,10 @@ class AbstractLossLaw(Module):
             ValueError: what is no fates (see `heliograph.learning`).
         """
         parts = as_fates(fates)
-        lost, p = np.concatenate(parts), np.concatenate([self.predicted(part) for part in parts])
+        lost, p = np.concatenate(parts), np.concatenate([self.predicted(stretch) for stretch in parts])
         with np.errstate(divide="ignore"):
-            result: Packets = np.where(np.isnan(lost), np.nan, np.where(lost == 1, np.log(p), np.log1p(-p)))
-        return result
+            logs: Packets = np.where(np.isnan(lost), np.nan, np.where(lost == 1, np.log(p), np.log1p(-p)))
+        return logs
 
 
 class IndependentLosses(AbstractLossLaw):
@@ -109,10 +109,10 @@ class MarkovLosses(AbstractLossLaw):
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
         counts = np.zeros((2**order, 2))
-        for part in as_fates(fates):
-            past, length = _past(part, order)
-            full = (length == order) & ~np.isnan(part)
-            np.add.at(counts, (past[full], part[full].astype(int)), 1.0)
+        for stretch in as_fates(fates):
+            past, length = _past(stretch, order)
+            full = (length == order) & ~np.isnan(stretch)
+            np.add.at(counts, (past[full], stretch[full].astype(int)), 1.0)
         return MarkovLosses(counts)
 
     @property
@@ -131,13 +131,13 @@ class MarkovLosses(AbstractLossLaw):
     def predicted(self, fate: Packets) -> Packets:
         """Probability (k + 1/2) / (n + 1) of each loss after the past, as far as it is known."""
         past, length = _past(fate, self.order)
-        result = np.zeros(len(fate))
+        probabilities = np.zeros(len(fate))
         for known in range(self.order + 1):
             counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)  # over fates further back
             p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
             here = length == known
-            result[here] = p[past[here] & (2**known - 1)]
-        return result
+            probabilities[here] = p[past[here] & (2**known - 1)]
+        return probabilities
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Link in modes that are the last fates; a past that was never seen is taken for even odds."""

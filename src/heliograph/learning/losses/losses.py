@@ -83,7 +83,7 @@ class Losses:
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Link with the losses of the law that predicts best among those that a channel can have."""
         able = [name for name in self.laws if name != RUNNING]
-        name = max(able, key=lambda item: self.held_out[item].log_likelihood) if self.held_out else self.best
+        name = max(able, key=lambda law: self.held_out[law].log_likelihood) if self.held_out else self.best
         return self.laws[name].channel(link)
 
 
@@ -115,12 +115,12 @@ def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict
 
     Args:
         fates: {name: fates}, as `fates_by_node` and `fates_by_hop` give them.
-        held_out: share of the packets that choose, as in `learn_losses`.
+        held_out: share of the packets that choose, as in `learn_losses` (default 1/3).
 
     Raises:
         ValueError: as `learn_losses`.
     """
-    return {name: learn_losses(item, held_out) for name, item in table("fates", fates, "fates").items()}
+    return {name: learn_losses(stretches, held_out) for name, stretches in table("fates", fates, "fates").items()}
 
 
 def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
@@ -138,14 +138,14 @@ def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Hel
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
     early = np.where(late, np.nan, everything)
-    ends = np.cumsum([len(part) for part in parts])[:-1]
+    ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
     laws = _fitted(np.split(early, ends), False)
     said = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
-    result = {}
-    for name, item in said.items():
-        gain, error = mean_and_error(item - said[INDEPENDENT])
-        result[name] = HeldOutScores(float(item.mean()), gain, error)
-    return result
+    scores = {}
+    for name, logs in said.items():
+        gain, error = mean_and_error(logs - said[INDEPENDENT])
+        scores[name] = HeldOutScores(float(logs.mean()), gain, error)
+    return scores
 
 
 def loss_memory(fates: object) -> LossMemory:
@@ -163,8 +163,8 @@ def loss_memory(fates: object) -> LossMemory:
     ratio = max(2 * (_likelihood(counts) - _likelihood(both[None])), 0.0)
     # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
     off, variance = 0.0, 0.0
-    for part in as_fates(fates):
-        for lost in _unbroken(part):
+    for stretch in as_fates(fates):
+        for lost in _unbroken(stretch):
             n, ones = len(lost), float(lost.sum())
             pairs = 2 * ones * (n - ones)
             off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
@@ -182,7 +182,7 @@ def _likelihood(counts: np.ndarray) -> float:
 def _unbroken(fate: np.ndarray) -> list[np.ndarray]:
     """Parts of a stretch without an unknown fate."""
     edges = np.flatnonzero(np.isnan(fate))
-    return [part[~np.isnan(part)] for part in np.split(fate, edges) if np.any(~np.isnan(part))]
+    return [stretch[~np.isnan(stretch)] for stretch in np.split(fate, edges) if np.any(~np.isnan(stretch))]
 
 
 STARTS = (logits(0.2, 0.8, 0.05), logits(0.2, 0.5, 0.3), logits(0.2, 0.95, 0.01))
@@ -210,11 +210,11 @@ class RunningRateLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        parts = [part[~np.isnan(part)] for part in as_fates(fates)]
+        parts = [stretch[~np.isnan(stretch)] for stretch in as_fates(fates)]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             share = expit(x)
-            ahead = [_ahead(part, *share) for part in parts]
+            ahead = [_ahead(stretch, *share) for stretch in parts]
             value, slope = (
                 sum(column) for column in zip(*(_log(*a) for a in zip(parts, ahead, strict=True)), strict=True)
             )

@@ -28,7 +28,7 @@ def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13)
 
     bounds = [(-END, END)] * len(starts[0])
     results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
-    best = min(results, key=lambda item: float(item.fun))
+    best = min(results, key=lambda end: float(end.fun))
     return np.asarray(best.x), -float(best.fun)
 
 

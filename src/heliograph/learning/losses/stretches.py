@@ -52,7 +52,7 @@ def fates_of_sequence(
         if stretch and (number <= stretch[-1] or number - stretch[-1] >= jump):
             stretches.append([])
         stretches[-1].append(number)
-    return [_gaps(np.array(part)) for part in stretches]
+    return [_gaps(np.array(numbers)) for numbers in stretches]
 
 
 def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:
@@ -99,7 +99,7 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
     """
     if not table("arrivals by hop", arrived, "arrays"):
         raise fail("arrivals by hop", "at least one hop", "none")
-    result: dict[str, Fates] = {}
+    by_hop: dict[str, Fates] = {}
     before: np.ndarray | None = None
     for name, value in arrived.items():
         received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
@@ -112,9 +112,9 @@ def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[
             raise fail(
                 f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
             )
-        result[name] = [np.where(before == 1, 1.0 - received, np.nan)]
+        by_hop[name] = [np.where(before == 1, 1.0 - received, np.nan)]
         before = received
-    return result
+    return by_hop
 
 
 def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *received']]") -> dict[str, Fates]:
@@ -129,7 +129,7 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
     Raises:
         ValueError: no table of numbers.
     """
-    result: dict[str, Fates] = {}
+    fates: dict[str, Fates] = {}
     for node, value in table("measurements", measurements, "arrays").items():
         name = f"measurements of {node!r}"
         values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
@@ -137,10 +137,10 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
             array(f"measurements of {node!r}", values[:, None] if values.ndim == 1 else values, (None, None), True)
         )
         if np.all(gone == gone[:, :1]):
-            result[node] = [gone[:, 0].astype(float)]
+            fates[node] = [gone[:, 0].astype(float)]
         else:
-            result |= {f"{node}.{i}": [lost.astype(float)] for i, lost in enumerate(gone.T) if not np.all(lost)}
-    return result
+            fates |= {f"{node}.{i}": [lost.astype(float)] for i, lost in enumerate(gone.T) if not np.all(lost)}
+    return fates
 
 
 def as_fates(value: object) -> Fates:
@@ -151,13 +151,13 @@ def as_fates(value: object) -> Fates:
     """
     listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
     items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
-    several = len(items) > 0 and all(rank("fates", item) == 1 for item in items)
-    parts = [array("fates", part, (None,), missing=True) for part in (items if several else [cast(ArrayLike, value)])]
-    for part in parts:
-        if np.any((part != 0) & (part != 1) & ~np.isnan(part)):
+    several = len(items) > 0 and all(rank("fates", x) == 1 for x in items)
+    parts = [array("fates", x, (None,), missing=True) for x in (items if several else [cast(ArrayLike, value)])]
+    for stretch in parts:
+        if np.any((stretch != 0) & (stretch != 1) & ~np.isnan(stretch)):
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
-    if not any(np.any(~np.isnan(part)) for part in parts):
+    if not any(np.any(~np.isnan(stretch)) for stretch in parts):
         raise fail("fates", "at least one packet of which the fate is known", "none")
-    return [part for part in parts if len(part)]
+    return [stretch for stretch in parts if len(stretch)]

@@ -91,7 +91,7 @@ def _periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
         added = close @ m.process[:, None] @ close.swapaxes(2, 3) + gains @ m.noise @ gains.swapaxes(2, 3)
         source = m.law[:, :, None, None] * added
         operators = [_operator(chain, loop) for chain, loop in zip(m.chain, loops, strict=True)]
-        constant = reduce(lambda total, item: item[0] @ total + item[1].ravel(),
+        constant = reduce(lambda total, step: step[0] @ total + step[1].ravel(),
                           zip(operators, source, strict=True), np.zeros(modes * n * n))  # fmt: skip
         product = reduce(lambda product, operator: operator @ product, operators)
         x, through = np.linalg.solve(np.eye(modes * n * n) - product, constant), []
@@ -153,10 +153,10 @@ def _adjoint(m: ModeSystem, loops: Parts, weights: Float[np.ndarray, "time n n"]
 
     def backwards(after: np.ndarray) -> list[np.ndarray]:
         """Sums that later steps add to L of the last, ..., the first step, and to that of the last before."""
-        result = [after]
+        sums = [after]
         for k in range(steps - 1, -1, -1):
-            result.append(back[k] @ (terms[k] + result[-1]))
-        return result
+            sums.append(back[k] @ (terms[k] + sums[-1]))
+        return sums
 
     # Around a period L before the first step is that behind the last.
     after = np.zeros(modes * n * n)
@@ -164,13 +164,13 @@ def _adjoint(m: ModeSystem, loops: Parts, weights: Float[np.ndarray, "time n n"]
         around = reduce(lambda product, factor: product @ factor, back)
         after = np.linalg.solve(np.eye(len(after)) - around, backwards(after)[-1])
     later = backwards(after)[:-1][::-1]
-    result = np.array([w + more for w, more in zip(terms, later, strict=True)]).reshape(steps, modes, n, n)
-    return np.asarray(result + result.swapaxes(2, 3)) / 2
+    adjoint = np.array([w + more for w, more in zip(terms, later, strict=True)]).reshape(steps, modes, n, n)
+    return np.asarray(adjoint + adjoint.swapaxes(2, 3)) / 2
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
     """sum_k,j <L, right side>, which has the error's gradient where X, K and L are fixed."""
-    parts, gains, ahead = (jnp.asarray(part) for part in solution)
+    parts, gains, ahead = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0) if m.start is None else jnp.concatenate([_initial(m)[None], parts[:-1]])
     close = jnp.eye(parts.shape[-1]) - gains @ m.output
     moved = m.transition[:, None] @ earlier @ m.transition[:, None].swapaxes(2, 3)

@@ -69,11 +69,11 @@ class Numbers(NamedTuple):
 
     def named(self, x: Array) -> dict[str, Any]:
         """Numbers by name, each in its shape."""
-        result, begin = {}, 0
+        by_name, begin = {}, 0
         for name, number in self.by_name.items():
-            result[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
+            by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
             begin += number.start.size
-        return result
+        return by_name
 
     def drawn(self, draws: np.random.Generator) -> Vector:
         """Another start: anywhere between the ends, or where there are none by a factor about the first."""
@@ -89,7 +89,7 @@ def as_numbers(free: object) -> Numbers:
     Raises:
         ValueError: nothing free, ends that do not enclose the start.
     """
-    result = {}
+    numbers = {}
     for name, value in table("free", free, "(start, low, high)").items():
         parts = items(f"free number {name!r}", value, "(start, low, high)")
         if len(parts) != 3:
@@ -98,12 +98,12 @@ def as_numbers(free: object) -> Numbers:
         low, high = (_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
-        result[name] = Number(start, low, high)
-    if YOUNG in result:
+        numbers[name] = Number(start, low, high)
+    if YOUNG in numbers:
         raise fail("free", f"names other than {YOUNG!r}, which stands for a scalar of the bound", YOUNG)
-    if not result:
+    if not numbers:
         raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
-    return Numbers(result)
+    return Numbers(numbers)
 
 
 def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
@@ -199,7 +199,7 @@ class TracedNetwork:
         # Cotangents: of the error through everything, and of each power alone.
         of_error, size = jax.grad(lagrangian)(m, solution), m.powers.size
         unit = jnp.eye(size).reshape(size, *m.powers.shape)
-        of_powers = jax.tree.map(lambda part: jnp.zeros((size, *part.shape)), m)._replace(powers=unit)
+        of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), m)._replace(powers=unit)
         cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
         slopes = jax.vmap(pull)(cotangents)[0]
         return Slopes(slopes[0], slopes[1:].reshape(*m.powers.shape, len(x)))
@@ -268,7 +268,7 @@ class NumberProblem:
                 near = near + INSIDE * (start - near)
                 values = {other: near if other == name else begin for other, begin in starts.items()}
                 try:
-                    self.network(np.concatenate([part.ravel() for part in values.values()]))
+                    self.network(np.concatenate([values.ravel() for values in values.values()]))
                 except InputError as error:
                     what = f"{' '.join(str(end).split())}, where: {error}"
                     raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
@@ -282,12 +282,12 @@ class NumberProblem:
         sharp = self.criterion if criterion is None else criterion
         key = x.tobytes(), sharp.sharpness
         if key not in self._last:
-            system = ModeSystem(*(None if part is None else np.asarray(part) for part in self._system(np.asarray(x))))
+            system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
             if system.start is None:
                 scale = np.sqrt(1 + np.ravel(self.numbers.named(x)[YOUNG])[0]) if self.young else 1.0
                 check_stable(system.transition[0] / scale)
             solution = solve_riccati(system, sharp)
-            slopes = Slopes(*(np.asarray(part) for part in self._slopes(np.asarray(x), solution)))
+            slopes = Slopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))
             self._last = {key: Point(system, solution, slopes, sharp)}
         return self._last[key]
 

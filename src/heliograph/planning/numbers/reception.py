@@ -74,7 +74,7 @@ def sources_of(network: Network) -> dict[str, Source]:
     if network.relays is not None:
         raise fail("network of a design", "nodes that receive sensors through channels", "relays that filter")
     shared = {} if network.common is None else {"common": network.common}
-    result = {}
+    sources = {}
     for name, node in (network.nodes | shared).items():
         if isinstance(node, Node | Common):
             sensor, channel = first(node.sensor), first(node.channel)
@@ -84,8 +84,8 @@ def sources_of(network: Network) -> dict[str, Source]:
             if isinstance(node, Node) and node.informed_by is not None:
                 raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
             refuse_angles("design", sensor)
-            result[name] = Source(node.sensor, node.channel)
-    return result
+            sources[name] = Source(node.sensor, node.channel)
+    return sources
 
 
 def transmitters_of(network: Network) -> tuple[str, ...]:
@@ -201,7 +201,7 @@ def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 def _flagged(name: str, channel: AbstractRandomAffine) -> JointModes:
     """Modes of a channel all of whose modes are observed, with the map in each."""
     parts = channel.maps if isinstance(channel, Stack) else ()
-    rest = [part for part in parts if not isinstance(part, ModeOutput)]
+    rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
     chains = memories(channel)
     markov = all(isinstance(memory, MarkovChain) for memory in chains.values())
     if not markov or len(parts) - len(rest) != len(chains):

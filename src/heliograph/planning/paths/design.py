@@ -159,8 +159,8 @@ def power_task(
     def information(powers: Powers) -> PathInformation:
         every = fixed.copy()
         every[:, free] = powers
-        result = path_information(paths, every)
-        return PathInformation(result.information, result.slope[:, free])
+        of_paths = path_information(paths, every)
+        return PathInformation(of_paths.information, of_paths.slope[:, free])
 
     # Where no total is given: that of the other limits, or so much that a hop's noise hardly counts.
     total = limits.total
@@ -192,11 +192,11 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
     return [whole, *(on.reshape(steps, len(distinct))[:, column] for on in choices if np.any(on))]
 
 
-def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
+def least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Powers of the least error within the limits of a `task`, and the certificate."""
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
-        whole = SplitPaths(*(part[:, problem.path] for part in task.whole()))
+        whole = SplitPaths(*(values[:, problem.path] for values in task.whole()))
         starts = [water_filling(problem.limits, problem.sensitivity, whole, starts[0])]
     powers = problem.solve(starts)
     assert powers is not None  # the starts are within the limits
@@ -220,7 +220,7 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
     if total > limits.total * (1 + MET):
-        least = least_error(task)[1].value
+        least = least_error_powers(task)[1].value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
     # The bound: of the linear model where the problem is convex, else of that of the envelopes.
     problem, near = free_total.problem, powers
@@ -277,7 +277,7 @@ def _check_reachable(task: PowerTask, target: float) -> None:
 
 def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, present: float) -> PowerDesign:
     """Design of a task: the least error, or the least power for a target."""
-    powers, certificate = least_error(task) if target is None else least_power(task, target)
+    powers, certificate = least_error_powers(task) if target is None else least_power(task, target)
     paths = task.problem.paths
     every = task.fixed.copy()
     every[:, task.free] = powers

@@ -92,23 +92,23 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps.
-    result: list[np.ndarray] = []
+    posteriors: list[np.ndarray] = []
     for k, received in enumerate(information):
         if k:
-            predicted = a[k] @ result[-1] @ a[k].T + q[k]
-        result.append(updated(predicted, received))
-    return np.array(result)
+            predicted = a[k] @ posteriors[-1] @ a[k].T + q[k]
+        posteriors.append(updated(predicted, received))
+    return np.array(posteriors)
 
 
 def adjoint(plants: Plants, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
-    result = np.array(weights)
+    adjoints = np.array(weights)
     if plants.start is None:
-        result[-1] = _around_period(phi, weights)
+        adjoints[-1] = _around_period(phi, weights)
     for k in range(len(p) - 2, -1, -1):
-        result[k] += phi[k + 1].T @ result[k + 1] @ phi[k + 1]
-    return result
+        adjoints[k] += phi[k + 1].T @ adjoints[k + 1] @ phi[k + 1]
+    return adjoints
 
 
 def _around_period(phi: Matrices, weights: Matrices) -> Float[np.ndarray, "n n"]:
@@ -178,7 +178,7 @@ def independent_paths(
         alpha: Var m / E g^2 of each hop, the noise in units of sent power, shaped likewise.
         error: over which steps: steady unless it has a period or a horizon.
         initial_mean: mean of x_0, shape (n,), zero unless given; used over a horizon.
-        initial_covariance: covariance of x_0, shape (n, n), needed over a horizon.
+        initial_covariance: covariance of x_0, shape (n, n), needed over a horizon (default none).
         transmitters: names of the transmitters, "sender0" and so on unless given.
 
     Returns:
@@ -242,11 +242,11 @@ def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path p
     """Values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
-    place = np.empty_like(paths.path)
-    place[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    result = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
-    result[:, paths.path, place] = values
-    return result, place
+    position = np.empty_like(paths.path)
+    position[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    along = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
+    along[:, paths.path, position] = values
+    return along, position
 
 
 def passed(powers: Powers, alpha: Powers) -> Powers:
@@ -258,14 +258,14 @@ def passed(powers: Powers, alpha: Powers) -> Powers:
 
 def path_information(paths: Paths, powers: Powers) -> PathInformation:
     """Information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
-    along, place = _along(paths, passed(powers, paths.alpha))
+    along, position = _along(paths, passed(powers, paths.alpha))
     # F, and the product of the other hops' factors for its derivative.
     others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
     product, full = along.prod(axis=-1), paths.second * fading(paths)
     left = full - paths.signal * product
     total = powers + paths.alpha
     by_power = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
-    slope = (full / left**2)[:, paths.path] * others[:, paths.path, place] * by_power
+    slope = (full / left**2)[:, paths.path] * others[:, paths.path, position] * by_power
     return PathInformation(product / left, slope)
 
 

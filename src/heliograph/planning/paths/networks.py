@@ -61,7 +61,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's moves.
     described = [_at_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
-    rows, second, signal, kappa, alpha, powers = (np.array(part) for part in list(zip(*described, strict=True))[:6])
+    rows, second, signal, kappa, alpha, powers = (np.array(values) for values in list(zip(*described, strict=True))[:6])
     moves = [at(plant, k) for k in range(steps)]
     plants = Plants(np.array([p.matrix for p in moves]), np.array([p.noise.covariance for p in moves]), start)
     path, names = np.array(described[0].path), tuple(described[0].names)
@@ -80,7 +80,7 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
         # a stack holds chains; a series is a chain once its wires are multiplied out
         case Stack():
             parts = enumerate(channel.maps, 1)
-            return [chain for i, part in parts for chain in chains_of(part, rows, f"{prefix}part{i}.")]
+            return [chain for i, affine in parts for chain in chains_of(affine, rows, f"{prefix}part{i}.")]
         case Series():
             head, *rest = channel.maps
             if isinstance(head, GainAndNoise) and not transmits(head) and rest:
@@ -102,28 +102,28 @@ def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefi
     row, fading, moved = rows[0], 1.0, False
     hops: dict[str, tuple[float, float]] = {}
     while parts:
-        part = parts.pop(0)
+        affine = parts.pop(0)
         # Series and losses are opened; an unobserved loss is fading.
-        if isinstance(part, Series):
-            parts = [*part.maps, *parts]
+        if isinstance(affine, Series):
+            parts = [*affine.maps, *parts]
             continue
-        if isinstance(part, Mixture):
-            inner, lost = _loss(part)
+        if isinstance(affine, Mixture):
+            inner, lost = _loss(affine)
             parts, fading = [inner, *parts], fading * lost
             continue
-        if not isinstance(part, GainAndNoise):
-            raise _unfit(type(part).__name__)
+        if not isinstance(affine, GainAndNoise):
+            raise _unfit(type(affine).__name__)
         # Hops, and wires between them.
         if not hops:
-            row = np.asarray(part.matrix)[0] @ rows if part.inputs > 1 else rows[0]  # of one number, in its units
-        if transmits(part):
+            row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]  # of one number, in its units
+        if transmits(affine):
             if moved:
                 raise _unfit("a relay that takes a reference off")
-            hops[f"{prefix}hop{len(hops) + 1}"] = _hop(part)
-        elif part.inputs != 1 or part.outputs != 1:
+            hops[f"{prefix}hop{len(hops) + 1}"] = _hop(affine)
+        elif affine.inputs != 1 or affine.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:
-            moved = moved or bool(np.any(np.asarray(part.noise.mean)))
+            moved = moved or bool(np.any(np.asarray(affine.noise.mean)))
     # Fading multiplies the last hop.
     if hops:
         last = list(hops)[-1]

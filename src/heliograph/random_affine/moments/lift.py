@@ -84,6 +84,9 @@ def _products(variables: int, degree: int, order: int) -> np.ndarray:
 def square(base: AbstractRandomAffine) -> Lift:
     """Return the lift of `base` to all monomials up to degree 2 (the quadratic lift).
 
+    Args:
+        base: a map of y to z.
+
     Raises:
         ValueError: when asked for moments whose matrix would need more than the stated memory.
     """

@@ -187,7 +187,7 @@ def _(law: FiniteSupport) -> AbstractNoise:
 
 @about_mean.register
 def _(law: Independent) -> AbstractNoise:
-    return Independent([about_mean(part) for part in law.parts])
+    return Independent([about_mean(component) for component in law.parts])
 
 
 @about_mean.register

@@ -28,13 +28,13 @@ Numbers = Any  # NumPy's or JAX's, or a list of such
 @cache
 def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
     """Exponents of all monomials of total degree `degree` in `variables` variables; degree 1 gives y_1, ..., y_p, 1."""
-    result = []
+    monomials = []
     for choice in combinations_with_replacement(range(variables), degree):
         powers = [0] * variables
         for index in choice:
             powers[index] += 1
-        result.append(tuple(powers))
-    return tuple(result)
+        monomials.append(tuple(powers))
+    return tuple(monomials)
 
 
 @cache

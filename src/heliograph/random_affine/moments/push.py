@@ -58,12 +58,12 @@ def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
 
 @push.register
 def _(channel: Series, order: int, moments: Array1) -> Array1:
-    return reduce(lambda m, part: push(part, order, m), channel.maps, moments)
+    return reduce(lambda m, affine: push(affine, order, m), channel.maps, moments)
 
 
 @push.register
 def _(channel: Mixture, order: int, moments: Array1) -> Array1:
-    parts = [push(part, order, moments) for part in channel.maps]
+    parts = [push(affine, order, moments) for affine in channel.maps]
     return channel.choice.probabilities @ stacked(parts)
 
 

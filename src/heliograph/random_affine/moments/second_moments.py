@@ -39,8 +39,8 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     match channel:
         case Series():
             low, high = moment_interval(channel.maps[0], order)
-            for part in channel.maps[1:]:
-                low, high = _multiply_matrices(moment_interval(part, order), (low, high))
+            for affine in channel.maps[1:]:
+                low, high = _multiply_matrices(moment_interval(affine, order), (low, high))
             return low, high
         case Stack():
             return _stack_interval(channel, order)
@@ -90,11 +90,11 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
         for m, table in zip(channel.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
             start, k = start + m.outputs, sum(a)
-            part = table[k]
-            if part is not None:
+            interval = table[k]
+            if interval is not None:
                 row = position(m.outputs + 1, k)[(*a, 0)]
                 product, degree = (
-                    _multiply_rows(product, degree, (part[0][row], part[1][row]), k, variables),
+                    _multiply_rows(product, degree, (interval[0][row], interval[1][row]), k, variables),
                     degree + k,
                 )
         # The constant's power is a column of its own.
@@ -183,7 +183,7 @@ def has_known_mean(described: SecondOrder) -> bool:
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
     size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
-    largest = max(np.max(np.abs(part), initial=0.0) for part in (described.shift.center, described.shift.radius))
+    largest = max(np.max(np.abs(bound), initial=0.0) for bound in (described.shift.center, described.shift.radius))
     return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
 
 
@@ -193,7 +193,7 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
         case GainAndNoise():
             return isinstance(channel.law, Constant)
         case Series() | Stack():
-            return all(has_known_gain(part) for part in channel.maps)
+            return all(has_known_gain(affine) for affine in channel.maps)
     return False
 
 
@@ -204,6 +204,9 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     Exact for a gain common to all components, else dominating. With one scalar gain g, the largest E_v (g - mu)^2,
     (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these multilinear (or convex) functions of the
     probabilities have their maxima.
+
+    Args:
+        channel: one that forgets.
 
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
@@ -257,9 +260,9 @@ def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
 def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
-    local = moments.mean[:-1]
-    spread = raw - symmetric_product(mean, local) - symmetric_product(local, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(local - mean, local - mean), _of_signal(raw)
+    law_mean = moments.mean[:-1]
+    spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
+    return spread, symmetric_product(law_mean - mean, law_mean - mean), _of_signal(raw)
 
 
 def _of_signal(tensor: Tensor) -> Tensor:
@@ -286,11 +289,11 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    items: Matrix = xp.abs(mean[:, :-1])
+    mean_size: Matrix = xp.abs(mean[:, :-1])
     # Sizes of the entries, for relative tolerances.
-    local = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(items, items)
+    scale = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
     loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
-    reach = xp.sqrt(xp.einsum("iiaa->ia", local))[:, None, :] * loud[:, None]
+    reach = xp.sqrt(xp.einsum("iiaa->ia", scale))[:, None, :] * loud[:, None]
     size = xp.sum(shape**2)
     # Least squares for s_v in gains_v = s_v M y y' M'.
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
@@ -300,7 +303,7 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     unit = xp.sqrt(xp.diagonal(largest))
     unit = _still(xp.where(unit > 0, unit, 1.0))
     gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
-    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * local)
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * scale)
     holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
@@ -323,16 +326,16 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
     blocks: list[list[QuadraticMap]] = []
     reach = []
-    for part in channel.maps:
-        stop = start + part.outputs
+    for affine in channel.maps:
+        stop = start + affine.outputs
         # Diagonal block, and the reach |H_i - M_i| of the mean of each part.
-        moments = second_order(part)
-        low, high = moment_interval(part, 1)
+        moments = second_order(affine)
+        low, high = moment_interval(affine, 1)
         xp = library(low, high, mean)
         reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
         blocks.append([_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
-    label = np.repeat(np.arange(len(channel.maps)), [part.outputs for part in channel.maps])
+    label = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
     apart = (label[:, None] != label[None, :])[:, :, None, None]
     xp = library(mean, reach)
     far, size = xp.concatenate(reach), xp.abs(mean)
@@ -342,8 +345,8 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
-        QuadraticMap(sum(q.center for q in item) + apart * center, sum(q.radius for q in item) + apart * radius)
-        for item, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+        QuadraticMap(sum(q.center for q in maps) + apart * center, sum(q.radius for q in maps) + apart * radius)
+        for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
 
 

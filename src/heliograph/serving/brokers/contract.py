@@ -37,8 +37,8 @@ def check_transport(broker: Broker, messages: int = 100, patience: float = 20.0)
 
     Args:
         broker: both sides of the broker to examine.
-        messages: number of messages sent in each part of the check.
-        patience: seconds that a single call may take at most.
+        messages: number of messages sent in each part of the check (default 100).
+        patience: seconds that a single call may take at most (default 20).
 
     Returns:
         Whether redelivered messages arrive in order. If not, the window of a service has to be longer than a redelivery
@@ -76,10 +76,10 @@ class _Check:
         # Third service: these arrive again, with those that were sent while nobody was reading.
         sent += await self._sent()
         async with self._service() as transport:
-            result = await self._until(transport, sent)
-            assert set(result) == set(sent), "acknowledge: expected no more than what was not acknowledged"
+            received = await self._until(transport, sent)
+            assert set(received) == set(sent), "acknowledge: expected no more than what was not acknowledged"
         await self._published()
-        return result == sent
+        return received == sent
 
     @asynccontextmanager
     async def _service(self) -> AsyncIterator[Transport]:
@@ -107,16 +107,16 @@ class _Check:
         async with self._service() as transport:
             await self._soon("publish", transport.publish([]))
             await self._soon("publish", transport.publish([now, *outputs]))
-        expected, result = [output.body for output in outputs], list[bytes]()
+        expected, arrived = [output.body for output in outputs], list[bytes]()
         for _ in range(1 + int(self.patience / PAUSE)):
             published = await self._soon("published", self.broker.published())
-            result = _once(body for body in published if body != now.body)
-            if len(result) >= len(expected):
+            arrived = _once(body for body in published if body != now.body)
+            if len(arrived) >= len(expected):
                 break
             await asyncio.sleep(PAUSE)
-        missing = len(set(expected) - set(result))
+        missing = len(set(expected) - set(arrived))
         assert not missing, f"publish: expected {len(expected)} outputs at the broker, {missing} are not"
-        assert result == expected, "publish: expected the outputs in order, and nothing else"
+        assert arrived == expected, "publish: expected the outputs in order, and nothing else"
 
     async def _sent(self) -> list[bytes]:
         bodies = self._bodies(self.messages)
@@ -125,26 +125,31 @@ class _Check:
 
     async def _until(self, transport: Transport, bodies: Sequence[bytes], acknowledge: bool = True) -> list[bytes]:
         """Receive until all of these bodies have arrived; return each once, in the order of first arrival."""
-        result = list[bytes]()
+        received = list[bytes]()
 
         async def listen() -> None:
-            while set(bodies) - set(result):
-                result.extend(await self._taken(await transport.receive(), acknowledge))
+            while set(bodies) - set(received):
+                received.extend(await self._taken(await transport.receive(), acknowledge))
+                await asyncio.sleep(0)  # a transport that never waits would let no time pass
 
+        # A timeout, and not `wait_for`: Python 3.11's may lose the cancellation of what waits inside, and never end.
         try:
-            await asyncio.wait_for(listen(), self.patience)
+            async with asyncio.timeout(self.patience):
+                await listen()
         except TimeoutError:
-            missing, total = len(set(bodies) - set(result)), len(bodies)
+            missing, total = len(set(bodies) - set(received)), len(bodies)
             what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
             raise AssertionError(what) from None
-        return _once(result)
+        return _once(received)
 
     async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
         """Receive for `silence` seconds, then cancel; return the bodies that arrived."""
         try:
-            return await self._taken(await asyncio.wait_for(transport.receive(), self.silence), acknowledge)
+            async with asyncio.timeout(self.silence):
+                batch = await transport.receive()
         except TimeoutError:
             return []
+        return await self._taken(batch, acknowledge)
 
     async def _silent(self, transport: Transport) -> None:
         """Receive and acknowledge late copies until none arrive."""
@@ -162,7 +167,8 @@ class _Check:
 
     async def _soon(self, what: str, waiting: Awaitable[T]) -> T:
         try:
-            return await asyncio.wait_for(waiting, self.patience)
+            async with asyncio.timeout(self.patience):
+                return await waiting
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 

@@ -72,9 +72,9 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
     from nats.aio.msg import Msg
     from nats.errors import Error
 
-    async def message(item: Msg) -> None:
-        if not item.subject.startswith(INTERNAL):
-            note(topics, item.subject.replace(".", "/"), item.data, time.time_ns())
+    async def message(received: Msg) -> None:
+        if not received.subject.startswith(INTERNAL):
+            note(topics, received.subject.replace(".", "/"), received.data, time.time_ns())
 
     async def ignored(error: Exception) -> None:
         """Leave out what the client would log with a traceback; what it raises is one line."""

@@ -173,9 +173,9 @@ class _Writer(_Connection):
         sent = set()
         for output in outputs:
             quality = 0 if output.kind == "provisional" else AT_LEAST_ONCE
-            item = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
+            handle = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:
-                sent.add(item.mid)
+                sent.add(handle.mid)
         with self.room:
             self.room.wait_for(lambda: sent <= self._arrived or not self.open)
             self._arrived.clear()

@@ -211,20 +211,20 @@ class Nats:
         transform = SubjectTransform(source, target) if parts > 1 else None
         subjects = [source, *self._subjects]
         expected = StreamConfig(self.stream, subjects=subjects, storage=StorageType.FILE, subject_transform=transform)
-        result = await _stream(server, expected)
-        known = result.config.subject_transform
+        info = await _stream(server, expected)
+        known = info.config.subject_transform
         if (known.dest if known else None) != (target if transform else None):
             raise fail(f"stream {self.stream} of {self.address}", f"one of {parts} parts", "one of another number")
-        return result.state.last_seq
+        return info.state.last_seq
 
 
 async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
     """Return the stream of this name, made if there is none, with all subjects that are expected."""
     try:
-        result = await server.stream_info(str(expected.name))
-        if set(expected.subjects or ()) <= set(result.config.subjects or ()):
-            return result
-        return await server.update_stream(result.config.evolve(subjects=expected.subjects))
+        info = await server.stream_info(str(expected.name))
+        if set(expected.subjects or ()) <= set(info.config.subjects or ()):
+            return info
+        return await server.update_stream(info.config.evolve(subjects=expected.subjects))
     except NotFoundError:
         return await server.add_stream(expected)
 

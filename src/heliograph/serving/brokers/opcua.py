@@ -88,12 +88,12 @@ async def reporting_of(node: Node) -> Reporting:
     places = [node]
     with contextlib.suppress(UaError):
         places += await node.get_referenced_nodes(ua.ObjectIds.HasHistoricalConfiguration)
-    for place in places:
-        deviation = await _property(place, "ExceptionDeviation")
+    for stated_by in places:
+        deviation = await _property(stated_by, "ExceptionDeviation")
         if deviation is None:
             continue
         # Absolute, or a share of the variable's range.
-        kind = await _property(place, "ExceptionDeviationFormat")
+        kind = await _property(stated_by, "ExceptionDeviationFormat")
         bounds = await _property(node, "EURange")
         if kind in (None, ABSOLUTE):
             return Reporting(float(str(deviation)), max(interval, 0.0) / 1e3)
@@ -206,9 +206,9 @@ async def _attribute(node: Node, attribute: ua.AttributeIds) -> float:
 
 
 async def _property(node: Node, name: str) -> object:
-    for item in await node.get_properties():
-        if (await item.read_browse_name()).Name == name:
-            return await item.read_value()
+    for member in await node.get_properties():
+        if (await member.read_browse_name()).Name == name:
+            return await member.read_value()
     return None
 
 

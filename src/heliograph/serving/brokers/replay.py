@@ -61,12 +61,12 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     steps = TIME_STEP not in network.inputs
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
-    local = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
+    given = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
     # An event for the inputs of each row, and for each node that measured something in it.
     events = []
     for k, at in enumerate(time.tolist()):
-        if local and (steps or k):
-            events.append(Event(INPUTS, k, at if steps else float(time[k - 1]), table.inputs[k, local]))
+        if given and (steps or k):
+            events.append(Event(INPUTS, k, at if steps else float(time[k - 1]), table.inputs[k, given]))
         received = {node: z[k] for node, z in table.measurements.items() if not np.isnan(z[k]).all()}
         events += [Event(node, k, at, z) for node, z in received.items()]
     return events, None if steps else origin
@@ -96,18 +96,18 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     falls = 1.0 if loss == 1 else loss * (1 - stays) / (1 - loss) if link.run > 1 else loss
     if falls > 1:
         raise fail("run", f"at least {loss / (1 - loss):g}, for so many losses", link.run)
-    result, lost = list[Event](), dict[str, bool]()
+    arriving, lost = list[Event](), dict[str, bool]()
     for event in events:
         if event.node == INPUTS:
-            result.append(_arriving(event, 0.0))
+            arriving.append(_arriving(event, 0.0))
             continue
         # The first state of the chain is drawn from the stationary law.
         before = lost.get(event.node, chance.random() < loss)
         now = chance.random() < (stays if before and link.run > 1 else falls)
         lost[event.node] = now
         copies = 0 if now else 1 + (chance.random() < twice)
-        result += [_arriving(event, chance.exponential(link.delay)) for _ in range(copies)]
-    return _in_order(result)
+        arriving += [_arriving(event, chance.exponential(link.delay)) for _ in range(copies)]
+    return _in_order(arriving)
 
 
 def along(events: Sequence[Event], trace: Path) -> list[Event]:

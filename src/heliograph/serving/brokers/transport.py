@@ -129,7 +129,11 @@ NAMELESS = "_"  # the word for the plant that has no name
 
 
 def word(plant: str) -> str:
-    """Encode a plant's name as one word of a topic or subject: letters, digits and hyphens stay, others become %XX."""
+    """Encode a plant's name as one word of a topic or subject: letters, digits and hyphens stay, others become %XX.
+
+    Args:
+        plant: name of a plant.
+    """
     text("plant", plant)
     return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
 

@@ -26,7 +26,7 @@ def description(fleet: Fleet) -> str:
     network = fleet.network
     parts: dict[str, PyTree] = {"plant": network.plant}
     parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
-    parts |= {f"fusion {name!r}": item for name, item in (network.fused | network.meshes).items()}
+    parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.lanes.given,
@@ -34,13 +34,13 @@ def description(fleet: Fleet) -> str:
         "outputs": fleet.pool.step_rows.outputs.size,
         "filters": _filter_columns(fleet),
     }
-    return json.dumps({"values": {name: _values(part) for name, part in parts.items()}, "layout": layout})
+    return json.dumps({"values": {name: _values(tree) for name, tree in parts.items()}, "layout": layout})
 
 
-def _values(part: PyTree) -> dict[str, object]:
-    """Return the numbers of a part by the path of their attributes."""
+def _values(tree: PyTree) -> dict[str, object]:
+    """Return the numbers of a tree by the path of their attributes."""
     results: dict[str, object] = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
             array = np.asarray(leaf)
             results[jax.tree_util.keystr(path)] = array.tolist() if array.size <= MOST else f"{array.size} numbers"
@@ -51,7 +51,7 @@ def _filter_columns(fleet: Fleet) -> dict[str, dict[str, list[Any]]]:
     """Return the columns of each filter's state by its name: of each leaf its shape, and its columns' begin and end."""
     network, flat = fleet.network, fleet.pool.step_rows.state
     numbered = flat.tree(np.arange(float(flat.size)))
-    local, central, *rest = numbered
+    by_kind, central, *rest = numbered
     results: dict[str, dict[str, list[Any]]] = {}
 
     def note(name: str, path: object, columns: np.ndarray) -> None:
@@ -59,13 +59,13 @@ def _filter_columns(fleet: Fleet) -> dict[str, dict[str, list[Any]]]:
         results.setdefault(name, {})[jax.tree_util.keystr(path)] = [list(columns.shape), begin, begin + columns.size]  # type: ignore[arg-type]  # a path
 
     # Filters of nodes stand by kind, (filter x node, ...); central ones by name.
-    for (group, filters), part in zip(network.kinds, local, strict=True):
+    for (group, filters), state in zip(network.kinds, by_kind, strict=True):
         names = [f"{node}/{name}" for name in filters for node in network.groups[group]]
-        for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+        for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
             for name, columns in zip(names, np.asarray(leaf), strict=True):
                 note(name, path, np.asarray(columns))
-    for name, part in central.items():
-        for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
+    for name, state in central.items():
+        for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
             note(f"{FUSED}/{name}", path, np.asarray(leaf))
     # What centres and neighbours remember goes on only if the nodes are the same.
     for path, leaf in jax.tree_util.tree_flatten_with_path(rest)[0]:
@@ -110,7 +110,7 @@ class Carrier:
             self._say(f"{what}: {line}")
 
     def _goes_on(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        shapes = [{path: leaf[0] for path, leaf in item.get(name, {}).items()} for item in (self._old["filters"], new)]
+        shapes = [{path: leaf[0] for path, leaf in side.get(name, {}).items()} for side in (self._old["filters"], new)]
         return shapes[0] == shapes[1]
 
     def carried(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -130,7 +130,7 @@ class Carrier:
         old, pool = self._old, self.fleet.pool
         names, names_here = list(old["nodes"]), list(self.fleet.network.names)
         same = [name for name in names if old["nodes"][name] == dict(self._sizes()).get(name)]
-        place = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
+        new_index = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
         # Parts of the bytes, as `plant_bytes` writes them.
         length, count, events, numbers = HEAD.unpack_from(body)
         head, at = json.loads(body[HEAD.size : HEAD.size + length]), HEAD.size + length
@@ -145,20 +145,20 @@ class Carrier:
         keys = whole[: 2 * count].reshape(count, 2)
         joint = self.fleet.rows_are_joint
         rows = [
-            (float(table[i, -1]), int(a) if joint or a == BEFORE else place.get(int(a), BEFORE), int(b), i)
+            (float(table[i, -1]), int(a) if joint or a == BEFORE else new_index.get(int(a), BEFORE), int(b), i)
             for i, (a, b) in enumerate(keys)
-            if i == 0 or joint or int(a) in place
+            if i == 0 or joint or int(a) in new_index
         ]
         rows = [rows[0], *sorted(rows[1:])]
         number = {row[-1]: i for i, row in enumerate(rows)}
-        new = np.stack([self._row(table[row[-1]], place, names) for row in rows])
+        new = np.stack([self._row(table[row[-1]], new_index, names) for row in rows])
         # Events, in the order of their rows.
         ends = np.cumsum([self._size(names, int(p)) for p in whole[2 * count + 1 :: 3]])
         parts = np.split(values, ends[:-1]) if events else []
         triples = whole[2 * count :].reshape(events, 3)
-        stay = [i for i, (row, p, _) in enumerate(triples) if int(p) in place and int(row) in number]
-        events_left = [(number[int(triples[i, 0])], place[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
-        integers = [x for row in rows for x in row[1:3]] + [x for item in events_left for x in item]
+        stay = [i for i, (row, p, _) in enumerate(triples) if int(p) in new_index and int(row) in number]
+        events_left = [(number[int(triples[i, 0])], new_index[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
+        integers = [x for row in rows for x in row[1:3]] + [x for event in events_left for x in event]
         data = np.concatenate([np.zeros(0), *(parts[i] for i in stay)])
         head["links"] = {name: link for name, link in head["links"].items() if name in (*same, "inputs")}
         text = json.dumps(head).encode()
@@ -177,34 +177,34 @@ class Carrier:
     def _sizes(self) -> Iterator[tuple[str, int]]:
         return ((name, node.received) for name, node in self.fleet.network.nodes.items())
 
-    def _size(self, names: Sequence[str], place: int) -> int:
-        return int(self._old["given"] if place < 0 else self._old["nodes"][names[place]])
+    def _size(self, names: Sequence[str], node: int) -> int:
+        return int(self._old["given"] if node < 0 else self._old["nodes"][names[node]])
 
-    def _row(self, row: np.ndarray, place: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
+    def _row(self, row: np.ndarray, new_index: Mapping[int, int], names: Sequence[str]) -> np.ndarray:
         """Return a row of the table with this network's columns."""
         old, pool, lanes = self._old, self.fleet.pool, self.fleet.lanes
         given, state = old["given"], old["state"]
-        result = np.zeros(pool.table.shape[1])
+        translated = np.zeros(pool.table.shape[1])
         # The state: of filters that go on their own, of others the start.
-        result[pool.state] = pool.step_rows.start
-        new = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
-        for name in new:
-            if self._goes_on(name, new):
-                for path, (_, begin, end) in new[name].items():
+        translated[pool.state] = pool.step_rows.start
+        filters = json.loads(self.mine[DESCRIPTION])["layout"]["filters"]
+        for name in filters:
+            if self._goes_on(name, filters):
+                for path, (_, begin, end) in filters[name].items():
                     _, first, last = old["filters"][name][path]
-                    result[begin:end] = row[first:last]
+                    translated[begin:end] = row[first:last]
         # Inputs held and step number, then measurements by node, inputs and time.
         after = state + old["outputs"]
-        result[pool.held], result[pool.at] = row[after : after + given], row[after + given]
-        numbers, received = result[pool.numbers], row[after + given + 1 :]
+        translated[pool.held], translated[pool.at] = row[after : after + given], row[after + given]
+        numbers, received = translated[pool.numbers], row[after + given + 1 :]
         numbers[:] = np.nan
         numbers[lanes.received :] = received[len(received) - given - 1 :]
         starts = np.cumsum([0, *old["nodes"].values()])
         here = np.cumsum([0, *(self.fleet.network.nodes[name].received for name in self.fleet.network.names)])
-        for i, j in place.items():
+        for i, j in new_index.items():
             if i >= 0:
                 numbers[here[j] : here[j + 1]] = received[starts[i] : starts[i + 1]]
-        return result
+        return translated
 
 
 def changes(mine: Identity, other: Identity) -> list[str]:
@@ -217,16 +217,16 @@ def changes(mine: Identity, other: Identity) -> list[str]:
         and name not in (DESCRIPTION, "what is computed", "layout of the store")
     ]
     # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program.
-    here, there = (json.loads(item[DESCRIPTION])["values"] for item in (mine, other))
-    for part in here:
-        if part in there:
+    here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
+    for name in here:
+        if name in there:
             lines += [
-                f"{part}{path}: {line}"
-                for path in {**there[part], **here[part]}
-                for line in _changed(there[part].get(path), here[part].get(path))
+                f"{name}{path}: {line}"
+                for path in {**there[name], **here[name]}
+                for line in _changed(there[name].get(path), here[name].get(path))
             ]
-            if not lines and mine.get(f"numbers of {part}") != other.get(f"numbers of {part}"):
-                lines.append(f"{part}: numbers of a long array")
+            if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
+                lines.append(f"{name}: numbers of a long array")
     if not lines and mine.get("what is computed") != other.get("what is computed"):
         lines.append("functions of the network")
     return lines
@@ -242,6 +242,6 @@ def _changed(before: object, after: object) -> list[str]:
         return [f"{before} -> {after}"]
     if a.shape != b.shape or before is None or after is None:
         return [f"{before} -> {after}"]
-    places = [tuple(map(int, place)) for place in np.argwhere(a != b)]
-    lines = [f"{list(place) if a.size > 1 else ''} {a[place]:.6g} -> {b[place]:.6g}".strip() for place in places]
+    places = [tuple(map(int, index)) for index in np.argwhere(a != b)]
+    lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in places]
     return lines[:LISTED] + ([f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else [])

@@ -11,34 +11,34 @@ from heliograph.numerics.check import fail, text
 PLACE = "a file, or a URL as postgresql://host/database"
 
 
-def engine_at(place: str) -> Engine:
+def engine_at(location: str) -> Engine:
     """Open the database of a store, at a path (SQLite) or a URL (PostgreSQL).
 
     Raises:
         ValueError: no path, or the URL of another kind of database; the message contains no password.
     """
-    engine = create_engine(url_of(place))
+    engine = create_engine(url_of(location))
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _durably)
         event.listen(engine, "begin", _at_once)
     return engine
 
 
-def url_of(place: str) -> URL:
-    """Read the place of a store.
+def url_of(location: str) -> URL:
+    """Read the location of a store.
 
     Raises:
         ValueError: no path, or the URL of another kind of database.
     """
-    text("store", place)
+    text("store", location)
     try:
-        url = make_url(place) if "://" in place else URL.create("sqlite", database=place)
+        url = make_url(location) if "://" in location else URL.create("sqlite", database=location)
     except ArgumentError:
         raise fail("store", PLACE, "something else") from None
     if url.get_backend_name() not in ("sqlite", "postgresql"):
         raise fail("store", PLACE, url.get_backend_name())
     if url.get_backend_name() == "sqlite" and (url.database or "").strip() in ("", ":memory:"):
-        raise fail("store", f"{PLACE}; none keeps nothing", repr(place))
+        raise fail("store", f"{PLACE}; none keeps nothing", repr(location))
     return url.set(drivername="postgresql+psycopg") if url.get_backend_name() == "postgresql" else url
 
 

@@ -62,11 +62,11 @@ def is_named(written: object, name: object) -> bool:
 
 
 def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    result = crc32(f"{name}".encode())
+    checksum = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()
-        result = crc32(data, crc32(f"\0{len(data)}\0".encode(), result))
-    return result
+        checksum = crc32(data, crc32(f"\0{len(data)}\0".encode(), checksum))
+    return checksum
 
 
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
@@ -83,23 +83,23 @@ class Store:
     damaged.
 
     Args:
-        place: a path, or a URL of PostgreSQL.
+        location: a path, or a URL of PostgreSQL.
         mine: identity of the network, which a stored state must agree with (`identity`); None opens any.
         process: name of this process in the journal; empty if there is only one.
         journal: number of outputs that the journal keeps at least (default 100,000).
-        opened: a store open on the same place, which has already looked for damage.
+        opened: a store open on the same location, which has already looked for damage.
         carrier: carries the plants of another network over; None refuses these.
 
     Raises:
-        ValueError: a place that cannot be opened; a database that is damaged as a whole; the state of another network,
-            version or precision.
+        ValueError: a location that cannot be opened; a database that is damaged as a whole; the state of another
+            network, version or precision.
     """
 
     keeps = True
 
     def __init__(
         self,
-        place: str,
+        location: str,
         mine: Identity | None,
         process: str = "",
         journal: int = 100_000,
@@ -107,7 +107,7 @@ class Store:
         carrier: Carrier | None = None,
     ):
         self.process, self.journal, self.identity = process, journal, {}
-        self._engine = engine_at(place)
+        self._engine = engine_at(location)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         try:
@@ -157,10 +157,10 @@ class Store:
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
                 return mine
         try:
-            result = dict(json.loads(stored))
+            identity = dict(json.loads(stored))
         except (ValueError, TypeError):
             raise self._broken("no network that it is of") from None
-        return {LAYOUT_KEY: "1"} | result
+        return {LAYOUT_KEY: "1"} | identity
 
     def _check_layout(self) -> None:
         """Refuse a store of an older release, which does not say where the state of each filter stands in its rows."""
@@ -242,8 +242,8 @@ class Store:
         with self._engine.begin() as connection:
             # The count locks the store for the other processes, which then see the new versions.
             newest = self._count(connection, NEWEST, len(entries))
-            result = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
-            if any(result.get(name, 0) != plant.version for name, plant in plants.items()):
+            versions = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
+            if any(versions.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
             outputs = [entry.numbered(newest - len(entries) + i) for i, entry in enumerate(entries, 1)]
             # Plants with their next version, the batch in the journal, and the counts.
@@ -276,15 +276,15 @@ class Store:
             ValueError: a damaged entry.
         """
         expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
-        result = list[Output]()
+        outputs = list[Output]()
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             for last, by, lines, written in connection.execute(expected):
                 if not is_whole(written, last, by, lines):
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
                 if process in (None, by):
-                    result += [_output(line) for line in lines.split("\n")]
-        return result
+                    outputs += [_output(line) for line in lines.split("\n")]
+        return outputs
 
     def number(self, name: str) -> int:
         """Return a stored count."""
@@ -312,15 +312,15 @@ class Store:
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
         self.identity = mine
 
-    def begin_from(self, place: str, mine: Identity, carrier: Carrier | None = None) -> None:
+    def begin_from(self, location: str, mine: Identity, carrier: Carrier | None = None) -> None:
         """Copy the plants of another store, which is not changed; those of another network by a carrier."""
-        other = Store(place, mine if carrier is None else None)
+        other = Store(location, mine if carrier is None else None)
         saying = self._saying(f"a database that takes the plants of {other.name}")
         with saying, self._engine.begin() as here, other._engine.connect() as there:
             if here.execute(select(func.count()).select_from(PLANTS)).scalar():
                 raise fail(f"store {self.name}", f"no plants yet, to begin from {other.name}", "some")
-            for part in there.execute(select(PLANTS)).mappings().partitions(AT_ONCE):
-                here.execute(PLANTS.insert(), [dict(row) for row in part])
+            for rows in there.execute(select(PLANTS)).mappings().partitions(AT_ONCE):
+                here.execute(PLANTS.insert(), [dict(row) for row in rows])
         self.damaged = other.damaged
         other.close()
         if carrier is not None and other.identity != self.identity:

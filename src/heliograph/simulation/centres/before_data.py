@@ -30,8 +30,8 @@ class CrossCovariances:
     """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.
 
     x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the initial state of the plant
-    and its noise at each step) and a_i independent between nodes, of covariance local_i. Biases are zero where the
-    filters' model is the world.
+    and its noise at each step) and a_i independent between nodes, of covariance independent_i. Biases are zero where
+    the filters' model is the world.
 
     Args:
         nodes: names of the nodes.
@@ -40,7 +40,7 @@ class CrossCovariances:
         state: deviation of x by sources (n, sources).
         bias: E e_i (node, n).
         shared: part of e_i by sources (node, n, sources).
-        local: covariance of the rest of e_i (node, n, n).
+        independent: covariance of the rest of e_i (node, n, n).
     """
 
     nodes: tuple[str, ...]
@@ -49,12 +49,12 @@ class CrossCovariances:
     state: Float[np.ndarray, "n sources"]
     bias: Float[np.ndarray, "node n"]
     shared: Float[np.ndarray, "node n sources"]
-    local: Float[np.ndarray, "node n n"]
+    independent: Float[np.ndarray, "node n n"]
 
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Cov(e_i, e_j) of all pairs."""
-        return np.asarray(joint_of(self.shared, self.local))
+        return np.asarray(joint_of(self.shared, self.independent))
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -68,16 +68,16 @@ class CrossCovariances:
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """Best unbiased weights W and the covariance W P W' of their error; linear in nodes where P allows it."""
-        weights = _weights(self.shared, self.local)
-        shared, local = weighted_sources(weights, self.shared, self.local)
-        return weights, np.asarray(shared @ shared.T + local)
+        weights = _weights(self.shared, self.independent)
+        shared, independent = weighted_sources(weights, self.shared, self.independent)
+        return weights, np.asarray(shared @ shared.T + independent)
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Moments at relays that forward the matrix-weighted estimate of their nodes, as the nodes of the next level.
 
         An error W e is a linear map of the nodes' errors, so its sources are W shared, and the rest has covariance
-        W local W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply it
-        level by level for a deeper tree; its root is `matrix_weights` of the last level.
+        W independent W' as long as no two relays receive the same node. Known means of the errors are subtracted. Apply
+        it level by level for a deeper tree; its root is `matrix_weights` of the last level.
 
         Raises:
             ValueError: no relays, a relay without nodes, unknown nodes, a node that two relays receive.
@@ -91,22 +91,22 @@ class CrossCovariances:
                 "nodes", "one relay for each", f"several for {sorted({n for n in received if received.count(n) > 1})}"
             )
         # Weights of each relay's nodes, and the moments of its error.
-        place = {name: i for i, name in enumerate(self.nodes)}
+        index = {name: i for i, name in enumerate(self.nodes)}
         parts = []
         for names in relays.values():
-            mine = [place[name] for name in names]
-            shared, local = self.shared[mine], self.local[mine]
-            parts.append(weighted_sources(_weights(shared, local), shared, local))
-        shared, local = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+            mine = [index[name] for name in names]
+            shared, independent = self.shared[mine], self.independent[mine]
+            parts.append(weighted_sources(_weights(shared, independent), shared, independent))
+        shared, independent = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
-        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, local)
+        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, independent)
 
 
-def _weights(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "n node n"]:
-    scale = np.sqrt(np.einsum("iaa->ia", local) + np.einsum("ias,ias->ia", shared, shared))
+def _weights(shared: np.ndarray, apart: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", apart) + np.einsum("ias,ias->ia", shared, shared))
     scale = np.where(scale > 0, scale, 1.0)
-    least = np.linalg.eigvalsh(local / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(factored_weights(shared, local) if least > REGULAR else matrix_weights(joint_of(shared, local)))
+    least = np.linalg.eigvalsh(apart / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, apart) if least > REGULAR else matrix_weights(joint_of(shared, apart)))
 
 
 def cross_covariances(
@@ -133,8 +133,8 @@ def cross_covariances(
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _prepared(alone, horizon, inputs)
     with jax.enable_x64(True):
-        result: Factors = to_numpy(_factors(filters, u))
-    parts = result.mean, result.state, result.bias, result.shared, result.local
+        factors: Factors = to_numpy(_factors(filters, u))
+    parts = factors.mean, factors.state, factors.bias, factors.shared, factors.independent
     return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
 
 
@@ -176,11 +176,11 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
 
     separate, _, _, known, *_ = filters.init()
     nodes, n = known[0].errors.bias.shape
-    items = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
-    start = separate, initial_factors(known[0].errors, items * len(u))
+    sources = n + (nodes * centre.size if isinstance(centre.observation_model, Together) else 0)  # sources of a step
+    start = separate, initial_factors(known[0].errors, sources * len(u))
 
-    def matrices(local: PyTree, u_k: jax.Array, k: jax.Array) -> Plan:
-        return centre.gathered(filters.matrices(centre, local, u_k, k))
+    def matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> Plan:
+        return centre.gathered(filters.matrices(centre, states, u_k, k))
 
     return centre.factors(start, matrices, filters.followed, u)
 
@@ -188,15 +188,15 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
 @quickly_compiled
 def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
     def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        (local, known), (k, u_k) = carry, row
+        (states, known), (k, u_k) = carry, row
         published: dict[str, jax.Array] = {}
         following = []
         for centre, state in zip(filters.informed, known, strict=True):
             means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
-            after, result = centre.step(state, filters.matrices(centre, local, u_k, k), means, u_k, k)
+            after, estimates = centre.step(state, filters.matrices(centre, states, u_k, k), means, u_k, k)
             following.append(after)
-            published |= {name: jnp.asarray(estimate.covariance) for name, estimate in result.items()}
-        return (filters.followed(local, u_k, k), tuple(following)), published
+            published |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
+        return (filters.followed(states, u_k, k), tuple(following)), published
 
-    local, _, _, known, *_ = filters.init()
-    return jax.lax.scan(body, (local, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    states, _, _, known, *_ = filters.init()
+    return jax.lax.scan(body, (states, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]

@@ -87,8 +87,8 @@ class Apart(Module):
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """Moments of the measurements, group after group."""
         m, n = self.size, len(mean)
-        parts = [Observation(*(jnp.zeros((self.counts[i], *s)) for s in ((m, n), (m,), (m, m)))) if item is None
-                 else item.observe(mean, covariance, k, m) for i, item in enumerate(self.groups)]  # fmt: skip
+        parts = [Observation(*(jnp.zeros((self.counts[i], *s)) for s in ((m, n), (m,), (m, m)))) if group is None
+                 else group.observe(mean, covariance, k, m) for i, group in enumerate(self.groups)]  # fmt: skip
         return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
@@ -137,19 +137,19 @@ class Centre(Module):
         errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
-    def moved(self, errors: Errors, local: Plan, u: jax.Array, k: jax.Array) -> Happened:
+    def moved(self, errors: Errors, plan: Plan, u: jax.Array, k: jax.Array) -> Happened:
         """Propagate the errors of filters with these matrices over step k, in the order of the nodes."""
-        motion, step, noise = self.moves(errors.mean, errors.covariance, local, u, k)
+        motion, step, noise = self.moves(errors.mean, errors.covariance, plan, u, k)
         return Happened(motion, step, noise, advance(errors, step, motion, noise))
 
     def moves(
-        self, mean: jax.Array, covariance: jax.Array, local: Plan, u: jax.Array, k: jax.Array
+        self, mean: jax.Array, covariance: jax.Array, plan: Plan, u: jax.Array, k: jax.Array
     ) -> tuple[Motion, ErrorStep, Array]:
         """Motion of plant and errors at step k, and the measurement noise, for a plant with these moments."""
         plant: LinearPlant = at(self.plant, k)
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*moved_state(mean, covariance, motion), k)
-        return motion, error_step(local, motion, observation), observation.noise
+        return motion, error_step(plan, motion, observation), observation.noise
 
     def factors(
         self, start: tuple[PyTree, Factors], matrices: Callable[..., Plan], follow: Callable[..., PyTree], u: Array
@@ -162,13 +162,13 @@ class Centre(Module):
         def body(
             carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, Factors], None]:
-            (local, factors), (k, u_k) = carry, row
+            (states, factors), (k, u_k) = carry, row
             spread = factors.state @ factors.state.T
-            motion, step, noise = self.moves(factors.mean, spread, matrices(local, u_k, k), u_k, k)
-            return (follow(local, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+            motion, step, noise = self.moves(factors.mean, spread, matrices(states, u_k, k), u_k, k)
+            return (follow(states, u_k, k), advance_factors(factors, step, motion, noise, k)), None
 
-        result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
-        return result
+        factors: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+        return factors
 
     def gathered(self, parts: Sequence[Plan]) -> Plan:
         """Matrices of the sources' filters in the order of the nodes, padded with zeros to the longest measurement."""
@@ -211,8 +211,8 @@ def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel])
 
 def described(channel: Channel) -> SecondOrder | OverTime:
     """Second moments of the channel where all of it arrives, for each step where it varies."""
-    result: SecondOrder | OverTime = at_each_step(lambda item: second_order(arrived(item)), channel)
-    return result
+    moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(arrived(step)), channel)
+    return moments
 
 
 Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
@@ -240,13 +240,13 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
 
 def along_estimates(nodes: Parts) -> bool:
     """Test whether errors can only be propagated along the estimates: some filter's gains depend on data."""
-    return any(isinstance(item, GaussianFilter) and not item.linear for _, _, item in nodes.values())
+    return any(isinstance(filter, GaussianFilter) and not filter.linear for _, _, filter in nodes.values())
 
 
 def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
-    for name, (_, _, item) in nodes.items():
-        if not isinstance(item, GaussianFilter) or item.linear:
-            raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", item)
+    for name, (_, _, filter) in nodes.items():
+        if not isinstance(filter, GaussianFilter) or filter.linear:
+            raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", filter)
     if shared:
         raise fail(f"fusion by {rule}", "nodes that share nothing but the plant, or filters whose gains depend on no "
                    "data", "nodes that share a channel")  # fmt: skip
@@ -256,13 +256,13 @@ def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     seen = set()
-    for name, (sensor, _, item) in nodes.items():
+    for name, (sensor, _, filter) in nodes.items():
         where = f"fusion by {rule}: node {name!r}"
         if not isinstance(first(sensor), LinearSensor):
             raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
-        if structure(item) not in seen and not is_linear_filter(item):
-            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(item).__name__)
-        seen.add(structure(item))
+        if structure(filter) not in seen and not is_linear_filter(filter):
+            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
+        seen.add(structure(filter))
 
 
 def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
@@ -285,6 +285,6 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 def _uncertain(channel: Channel) -> bool:
     """Test whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(arrived(item).corner_count() > 1 for item in unstack(channel))
+        return any(arrived(step).corner_count() > 1 for step in unstack(channel))
     except ValueError:  # too many corners to list
         return True

@@ -11,7 +11,7 @@ from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
-from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.check import array, fail, instance, of_each
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree
@@ -55,10 +55,10 @@ class Edges(Module):
             flags, following = jnp.asarray(self.lossless()[:, 0]), []
             for group, state in zip(self.groups, states, strict=True):
 
-                def single(item: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
-                    channel = at(item.channel, k)
-                    state, z = deliver(channel, state, jnp.zeros(sent(channel)), key, count, item.checksums,
-                                       item.memories)  # fmt: skip
+                def single(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
+                    channel = at(edge.channel, k)
+                    state, z = deliver(channel, state, jnp.zeros(sent(channel)), key, count, edge.checksums,
+                                       edge.memories)  # fmt: skip
                     arrives, late = ~jnp.any(jnp.isnan(z)), late_part(channel)
                     if not self.past:
                         return state, arrives
@@ -79,8 +79,8 @@ class Edges(Module):
         """Flags of a step at which everything arrives at once."""
         module = library(self.present)
         flags = module.where(self.present, 0, -1) if self.past else self.present
-        result: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)
-        return result
+        repeated: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)
+        return repeated
 
     def recorded(
         self, name: str, nodes: Sequence[str], reports: Recorded | None, steps: int
@@ -92,10 +92,10 @@ class Edges(Module):
         Raises:
             ValueError: nodes without flags or the reverse, shapes that do not fit.
         """
-        result = np.repeat(self.lossless()[None], steps, axis=0)
+        flags = np.repeat(self.lossless()[None], steps, axis=0)
         # Everything arrives, unless a report says otherwise.
         if reports is None and not self.groups:
-            return result
+            return flags
         receivers = [node for node, there in zip(nodes, self.present, strict=True) if there[1:].any()]
         if reports is None or set(reports) != set(receivers):
             given = "none" if reports is None else list(reports)
@@ -103,17 +103,17 @@ class Edges(Module):
         for i, node in enumerate(nodes):
             if node not in reports:
                 continue
-            item = reports[node]
+            report = reports[node]
             count = int(self.present[i, 1:].sum())
-            values = array(f"reports of node {node!r}", item.values if isinstance(item, SentReports) else item,
+            values = array(f"reports of node {node!r}", report.values if isinstance(report, SentReports) else report,
                            (steps, self.rounds * count), missing=True)  # fmt: skip
             values = values.reshape(steps, self.rounds, count)
             if self.past and not np.isin(values[~np.isnan(values)], np.arange(self.past + 1)).all():
                 expected = f"ages of what arrives, from 0 to {self.past} steps, NaN where nothing does"
                 raise fail(f"reports of node {node!r}", expected, "other numbers")
             ages = np.where(np.isnan(values), -1, values).astype(int)
-            result[:, i, :, 1 : count + 1] = ages if self.past else ages >= 0
-        return result
+            flags[:, i, :, 1 : count + 1] = ages if self.past else ages >= 0
+        return flags
 
 
 def edges_of(fusion: Fusion, graph: Graph) -> Edges:
@@ -124,32 +124,33 @@ def edges_of(fusion: Fusion, graph: Graph) -> Edges:
     """
     if fusion.link is None:
         return Edges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
-    sender_receiver = graph.edges
-    names = [f"{graph.nodes[j]} to {graph.nodes[i]}" for j, i in sender_receiver]
-    if isinstance(fusion.link, Mapping) and set(fusion.link) != set(names):
-        wrong = sorted(set(fusion.link) ^ set(names))[:3]
-        raise fail("links between neighbours", "one for each edge SENDER to RECEIVER", f"a mismatch in {wrong}")
-    channels = [fusion.link[name] if isinstance(fusion.link, Mapping) else fusion.link for name in names]
-    for channel in {id(c): c for c in channels}.values():
-        check_edge(channel)
+    links = edge_links(fusion.link, graph)
+    for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
+        check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
-    groups, past = channel_groups(dict(zip(names, channels, strict=True))), max(first(c).past for c in channels)
-    return Edges(groups, slots, graph.present, fusion.rounds, past)
+    past = max(first(channel).past for channel in links.values())
+    return Edges(channel_groups(links), slots, graph.present, fusion.rounds, past)
 
 
-def check_edge(link: Channel) -> None:
+def edge_links(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
+    """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver."""
+    names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
+    return dict(zip(names, of_each("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True))
+
+
+def check_edge(what: str, link: Channel) -> None:
     """Refuse a link that changes a message, and losses or delays that the receiver does not know of."""
-    instance("link between neighbours", first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
-    for item in unstack(link):
-        late = late_part(item)
+    instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
+    for step in unstack(link):
+        late = late_part(step)
         if late is not None and not (late.constant or late.timestamped):
-            raise fail("link between neighbours", "delays that the receiver knows (timestamped=True)", "others")
-        inside = _without_losses(item)
+            raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
+        inside = _without_losses(step)
         inside = inside if late is None else _without_losses(late.link)
-        for part in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
-            if part.remembers or part.past or not _is_perfect(part):
+        for mode in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
+            if mode.remembers or mode.past or not _is_perfect(mode):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
-                raise fail("link between neighbours", expected, type(first(link)).__name__)
+                raise fail(what, expected, type(first(link)).__name__)
 
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:
@@ -187,7 +188,7 @@ def loss_rate(channel: Channel | None) -> float | None:
     if not isinstance(channel, Modes):
         chance = arrival_chance(channel)
         return None if chance is None else 1 - arrival * chance
-    chances = [arrival_chance(item) for item in channel.maps]
+    chances = [arrival_chance(mode) for mode in channel.maps]
     if channel.memory.name is not None or None in chances:
         return None
     losses = 1 - arrival * np.array(chances, dtype=float)

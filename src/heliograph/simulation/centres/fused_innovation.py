@@ -60,16 +60,16 @@ class FusedInnovation(Module):
         carry: tuple[jax.Array, ...] | None = None
         for kind, f in self.sources:
             # Numbers of each node's filter, its state and what it receives.
-            item, why = alike[kind], skip[kind]
-            mine = slice(f * item.nodes, (f + 1) * item.nodes)
-            filters, local = jax.tree.map(
-                lambda a, mine=mine: a[mine] if eqx.is_array(a) else a, (item.filters, states[kind])
+            stacked, why = alike[kind], skip[kind]
+            mine = slice(f * stacked.nodes, (f + 1) * stacked.nodes)
+            filters, beliefs = jax.tree.map(
+                lambda a, mine=mine: a[mine] if eqx.is_array(a) else a, (stacked.filters, states[kind])
             )
-            received = z[item.group] if why is None else jnp.where(why[f][:, None] > 0, jnp.nan, z[item.group])
+            received = z[stacked.group] if why is None else jnp.where(why[f][:, None] > 0, jnp.nan, z[stacked.group])
             numbers, static = eqx.partition(filters, eqx.is_array)
             # Prediction from the fused estimate, by the first node's model of the plant.
             if carry is None:
-                head, state = jax.tree.map(lambda a: a[0], (numbers, local))
+                head, state = jax.tree.map(lambda a: a[0], (numbers, beliefs))
                 start = eqx.combine(head, static).predict(_with(state, *before), u, k)
                 carry = start.mean, start.covariance, jnp.zeros(()), jnp.zeros(())
 
@@ -82,8 +82,8 @@ class FusedInnovation(Module):
 
             # What else a filter's state holds, predicted; then correction by node after node.
             predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
-            rows = numbers, predict(filters, local), received
-            carry, _ = jax.lax.scan(correct, carry, rows, unroll=min(item.nodes, UNROLLED))
+            rows = numbers, predict(filters, beliefs), received
+            carry, _ = jax.lax.scan(correct, carry, rows, unroll=min(stacked.nodes, UNROLLED))
         assert carry is not None  # there is at least one node
         _, _, distance, arrived = carry
         return FusedDistance(jnp.where(arrived > 0, distance, jnp.nan), arrived)
@@ -104,15 +104,15 @@ def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, Fus
     There is none where a filter's state is more than a mean and a covariance, such as a mixture, or a fusion claims no
     covariance, or where nodes share a channel, fading or relays: their measurements' noises then depend on each other.
     """
-    results: dict[str, FusedInnovation] = {}
+    tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
-        return results
+        return tests
     places, plant = network.places(), at(network.plant, 0)
     start = Belief(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
     claims = network.claims()
-    for name, item in network.fused.items():
-        if isinstance(item, Fusion) and claims[FUSED][name] != "none":
-            sources, _ = gathering(network, places, network.nodes_with(item.filter), item.filter)
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
+            sources, _ = gathering(network, places, network.nodes_with(fusion.filter), fusion.filter)
             if all(isinstance(eqx.filter_eval_shape(alike[kind].init), WHOLE) for kind, _ in sources):
-                results[name] = FusedInnovation(start, sources)
-    return results
+                tests[name] = FusedInnovation(start, sources)
+    return tests

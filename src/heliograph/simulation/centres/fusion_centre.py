@@ -47,16 +47,16 @@ class CentreFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> CentreState:
         """Return the state before any report."""
-        local, _, _, known, *_ = self.filters.init()
+        states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
-        return CentreState(local, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
+        return CentreState(states, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
 
     @predicts
     def predict(self, state: CentreState, u: ArrayLike = (), k: Step = 0) -> CentreState:
         """Predict plant and all errors; the nodes send their reports."""
         (centre,), u, step = self.filters.informed, jnp.asarray(u), jnp.asarray(k)
-        local: Plan = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
-        happened = centre.moved(state.errors, local, u, step)
+        plan: Plan = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
+        happened = centre.moved(state.errors, plan, u, step)
         following = self.filters.followed(state.nodes, u, step)
         return CentreState(following, happened.errors, moved(state.known, happened, at(self.links, k)))
 

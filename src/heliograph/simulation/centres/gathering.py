@@ -51,7 +51,7 @@ class Fused(Module):
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
-        return over_all(over_all(lambda item: at(item, 0).init(n), nodes), fusions)(self.quantizers)
+        return over_all(over_all(lambda quantizer: at(quantizer, 0).init(n), nodes), fusions)(self.quantizers)
 
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
@@ -81,7 +81,7 @@ class Fused(Module):
         joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
             return jnp.stack(joined)
-        return jnp.stack([part[order] for part, order in zip(joined, self.order, strict=True)])
+        return jnp.stack([estimates[order] for estimates, order in zip(joined, self.order, strict=True)])
 
 
 class Reporting(Module):
@@ -115,10 +115,10 @@ class Reporting(Module):
 def fusions_of(network: Network) -> tuple[Fused, ...]:
     """Fusions of the network, those of one structure stacked."""
     alike: dict[object, list[str]] = {}
-    for name, item in network.fused.items():
-        if isinstance(item, Fusion) and not isinstance(item.rule, AbstractInformedFusion):
-            nodes = network.nodes_with(item.filter)
-            alike.setdefault(structure((item.rule, item.uplinks(nodes), (None,) * len(nodes))), []).append(name)
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
+            nodes = network.nodes_with(fusion.filter)
+            alike.setdefault(structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes))), []).append(name)
     places, claims = network.places(), network.claims().get(FUSED, {})
     return tuple(_fused(network, names, places, [claims[name] for name in names]) for names in alike.values())
 
@@ -127,17 +127,17 @@ def _fused(
     network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
 ) -> Fused:
     """Stack fusions of one structure, with the places of the estimates that they fuse."""
-    items = [item for item in (network.fused[name] for name in names) if isinstance(item, Fusion)]
-    nodes = [network.nodes_with(item.filter) for item in items]
+    fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
+    nodes = [network.nodes_with(fusion.filter) for fusion in fusions]
     sources, order = [], []
     # Kinds and filters of the sources, and the order of the nodes in them.
-    for item, mine in zip(items, nodes, strict=True):
-        source, which = gathering(network, places, mine, item.filter)
+    for fusion, mine in zip(fusions, nodes, strict=True):
+        source, which = gathering(network, places, mine, fusion.filter)
         sources.append(source)
         order.append(which)
     # Numbers of all fusions along a leading axis.
-    quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
-    rules = stack([item.rule for item in items])
+    quantizers = stack([fusion.uplinks(mine) for fusion, mine in zip(fusions, nodes, strict=True)])
+    rules = stack([fusion.rule for fusion in fusions])
     angles = first(network.plant).angles
     return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
 
@@ -145,9 +145,9 @@ def _fused(
 def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
     """Centres of the network, one for the informed fusions of each filter."""
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
-    for name, item in network.fused.items():
-        if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion) and not item.by_report:
-            rules.setdefault(item.filter, {})[name] = item.rule
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, Fusion) and isinstance(fusion.rule, AbstractInformedFusion) and not fusion.by_report:
+            rules.setdefault(fusion.filter, {})[name] = fusion.rule
     return tuple(_centre(network, name, mine) for name, mine in rules.items())
 
 

@@ -62,10 +62,10 @@ class LinearisedCentre(Module):
         k: jax.Array,
     ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
         """Return the next state, and estimates by fusion, from the sources' matrices and means after the step."""
-        local, reports = gathered(parts, self.order, self.size), jnp.concatenate(means)[self.order]
+        linear, reports = gathered(parts, self.order, self.size), jnp.concatenate(means)[self.order]
         # I - K_i C_i of all nodes.
         plant = at(self.plant, k)
-        keep = jnp.eye(reports.shape[-1]) - local.gain @ local.output
+        keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output
         following, results = {}, {}
         for name, rule in self.rules.items():
             before = state[name]
@@ -74,11 +74,11 @@ class LinearisedCentre(Module):
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
-            step = _shared_step(matrix, keep, local.gain)
-            errors = _advanced(before.errors, step, motion.noise, local.noise)
+            step = _shared_step(matrix, keep, linear.gain)
+            errors = _advanced(before.errors, step, motion.noise, linear.noise)
             if isinstance(rule, AllReports):
-                step = step._replace(drift=_drift(before.rule, matrix, moved, keep, local))
-            after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, local.noise, errors), reports)
+                step = step._replace(drift=_drift(before.rule, matrix, moved, keep, linear))
+            after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, linear.noise, errors), reports)
             following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
         return following, results
 
@@ -89,11 +89,11 @@ def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorSt
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
 
 
-def _drift(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
+def _drift(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised) -> jax.Array:
     """F_i (E e_i- - A E e_i): each filter's prediction is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)
-    return jnp.einsum("iab,ib->ia", keep, moved - local.predicted - before @ matrix.T)
+    return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)
 
 
 def _advanced(errors: Errors, step: ErrorStep, noise: Array, received: Array) -> Errors:

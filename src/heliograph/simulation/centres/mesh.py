@@ -10,8 +10,9 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion, Observation, moved_state
 from heliograph.fusion.intersection import inverse
-from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of, transitions
+from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of, information_of
 from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
@@ -19,7 +20,6 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.centre import Apart, ObservationModel, observation_model
@@ -125,8 +125,9 @@ class Mesh(Module):
 
         `ahead` has weights that were computed before.
         """
-        there = jnp.concatenate([self._rows(part) for part in z])[self.observation_model.order]
-        blocks, present = self.blocks(state.joint), ~jnp.isnan(there)
+        there = jnp.concatenate([self._rows(rows) for rows in z])[self.observation_model.order]
+        blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
+        present = ~jnp.isnan(there)
         messages = self._messages(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         parts = self.parts(state.covariance, blocks, state.plant, present, arrived, u, k, ahead, messages)
@@ -184,7 +185,7 @@ class Mesh(Module):
         ahead: Ahead = (), messages: Messages | None = None,
     ) -> Parts:  # fmt: skip
         """Everything at step k but the estimates, from the covariances before it and what is there and arrives."""
-        covariance, there, arrived, u = (jnp.asarray(part) for part in (covariance, there, arrived, u))
+        covariance, there, arrived, u = (jnp.asarray(x) for x in (covariance, there, arrived, u))
         held = None if blocks is None else jnp.asarray(blocks)
         plant: LinearPlant = at(self.plant, jnp.asarray(k))
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
@@ -225,13 +226,6 @@ class Mesh(Module):
         complete = jax.vmap(information_of)(gain, noise, real)[1]
         return Data(observation, weighted, information, complete)
 
-    def blocks(self, joint: jax.Array | None) -> jax.Array | None:
-        """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
-        if joint is None:
-            return None
-        rows, columns = self.senders[:, :, None], self.senders[:, None]
-        return jnp.moveaxis(joint[rows, :, columns, :], 3, 2)
-
     def _over_nodes(
         self,
         function: Callable[..., PyTree],
@@ -246,15 +240,15 @@ class Mesh(Module):
         information, traces = jax.vmap(inverse)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         both = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         results = []
-        for part, known in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
-            rows, width = part.rows, part.width
+        for bucket, known in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
+            rows, width = bucket.rows, bucket.width
             theirs = (self.senders if senders is None else senders)[rows, :width]
             block = None if blocks is None else blocks[rows, :width, :, :width]
-            item = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
+            seen = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
             if self.alpha is not None:  # what was sent last errs by more than the estimate
                 wider = np.where(np.arange(width) > 0, (1 + np.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
-                item = item._replace(traces=item.traces * wider, information=item.information / wider[:, None, None])
-            results.append(both(part.rule, item, *(leaf[rows] for leaf in rest), known))
+                seen = seen._replace(traces=seen.traces * wider, information=seen.information / wider[:, None, None])
+            results.append(both(bucket.rule, seen, *(leaf[rows] for leaf in rest), known))
         if len(results) == 1:
             return results[0]
         # Rows of one length again, in the order of the nodes.
@@ -276,8 +270,8 @@ class Mesh(Module):
 
     def sum_of(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Sum over what arrived of values by node."""
-        result: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
-        return result
+        sums: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
+        return sums
 
     def gains(
         self, covariance: jax.Array, blocks: jax.Array | None, present: jax.Array, motion: Motion,
@@ -286,41 +280,31 @@ class Mesh(Module):
         """Gains of all nodes."""
 
         def single(
-            rule: AbstractFusion, item: Believed, arrived: jax.Array, every: jax.Array, known: Sequence[jax.Array]
+            rule: AbstractFusion, belief: Believed, arrived: jax.Array, every: jax.Array, known: Sequence[jax.Array]
         ) -> Gains:
             step = Step(motion.matrix, motion.noise, arrived, every)
             if known:
                 return gains_of(Weights(jnp.eye(len(motion.shift)), *known), step)
-            return rule.neighbour_gains(item, step)
+            return rule.neighbour_gains(belief, step)
 
-        result: Gains = self._over_nodes(single, covariance, blocks, present, information, complete,
+        gains: Gains = self._over_nodes(single, covariance, blocks, present, information, complete,
                                          ahead=ahead, senders=senders)  # fmt: skip
-        return result
+        return gains
 
     def ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
         """Weights of many steps, by part of the nodes; none where they depend on more than what arrives."""
-        weights = [part.rule.weights_ahead(arrived[:, part.rows, -1, : part.width])
-                 for part in self.buckets if isinstance(part.rule, FrozenWeights)]  # fmt: skip
+        weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
+                 for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
     def _moved(self, joint: jax.Array, parts: Parts, present: jax.Array) -> Float[jax.Array, "node n node n"]:
-        """J+ = M J M' + F Q F' + sum_l K_l R_l K_l', with K_il = W_i H_l' R_l^-1."""
-        gains, motion = parts.gains, parts.motion
-        nodes, n = len(self.senders), len(motion.shift)
-        m = self._spread(transitions(gains, motion.matrix))
-        k = self._spread(jnp.where(present[:, :, None, None], gains.gain[:, None], 0.0))
-        f = gains.innovation.reshape(nodes * n, n)
-        weighted = jnp.einsum("ajb,jbc->ajc", k.reshape(nodes * n, nodes, n), parts.data.information).reshape(k.shape)
-        result = m @ joint.reshape(m.shape) @ m.T + f @ motion.noise @ f.T + weighted @ k.T
-        return symmetrize(result).reshape(nodes, n, nodes, n)
-
-    def _spread(self, blocks: Float[jax.Array, "node degree n n"]) -> Float[jax.Array, "N N"]:
-        """Matrix of all nodes with these blocks; padding adds nothing."""
-        nodes, _, n, _ = blocks.shape
-        held = jnp.where(jnp.asarray(self.edges.present)[:, :, None, None], blocks, 0.0)
-        rows = jnp.arange(nodes)[:, None]
-        empty = jnp.zeros((nodes, nodes, n, n))
-        return empty.at[rows, self.senders].add(held).swapaxes(1, 2).reshape(nodes * n, nodes * n)
+        """Joint covariance after a step."""
+        gains, motion, size = parts.gains, parts.motion, joint.shape[0] * joint.shape[1]
+        measured = used(gains.gain, present)
+        m, ws, w = (spread(jnp.asarray(blocks), self.senders, self.edges.present) for blocks in (
+            transitions(gains, motion.matrix), measured @ parts.data.information[self.senders], measured))  # fmt: skip
+        after = joint_after(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
+        return jnp.asarray(after).reshape(joint.shape)
 
     def _by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
         """Estimates (1, node, ...) of the mesh's nodes in each of the network's groups."""
@@ -329,9 +313,9 @@ class Mesh(Module):
         )
 
 
-def _weights(rule: AbstractFusion, item: Believed, *_: PyTree) -> Weights:
+def _weights(rule: AbstractFusion, belief: Believed, *_: PyTree) -> Weights:
     """Weights of an exchange that only intersects, with the covariance after it."""
-    return rule.neighbour_weights(item)
+    return rule.neighbour_weights(belief)
 
 
 def _padded(parts: jax.Array, degree: int) -> Float[jax.Array, "node degree n *n"]:
@@ -346,7 +330,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
     nodes = network.mesh_nodes(name)
     graph = graph_of(fusion.neighbours, nodes)
     # Models of the measurements, group after group.
-    place = {node: i for i, node in enumerate(nodes)}
+    index = {node: i for i, node in enumerate(nodes)}
     groups: list[ObservationModel | None] = []
     order: dict[str, int] = {}
     for names in network.groups:
@@ -354,13 +338,11 @@ def mesh_of(network: Network, name: str) -> Mesh:
         groups.append(observation_model([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
         order |= {node: len(order) + i for i, node in enumerate(names)}
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
-    mine = [tuple(place[node] for node in network.groups[kind.group]) for kind in kinds]
+    mine = [tuple(index[node] for node in network.groups[kind.group]) for kind in kinds]
     return Mesh(
         plant=network.plant,
-        buckets=tuple(
-            Rows(fusion.rule.placed(part), part.senders[:, 0], part.senders.shape[1]) for part in graph.buckets()
-        ),
-        ranks=np.argsort(np.concatenate([part.senders[:, 0] for part in graph.buckets()])),
+        buckets=tuple(Rows(fusion.rule.placed(b), b.senders[:, 0], b.senders.shape[1]) for b in graph.buckets()),
+        ranks=np.argsort(np.concatenate([bucket.senders[:, 0] for bucket in graph.buckets()])),
         edges=edges_of(fusion, graph),
         observation_model=Apart(
             tuple(groups),
@@ -384,10 +366,10 @@ def meshes_of(network: Network) -> dict[str, Mesh]:
     Raises:
         ValueError: too many nodes for a rule that follows the joint covariance of their errors.
     """
-    for name, item in network.meshes.items():
+    for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
-        if item.rule.needs_joint and nodes > DENSE:
-            kind = type(item.rule).__name__
+        if fusion.rule.needs_joint and nodes > DENSE:
+            kind = type(fusion.rule).__name__
             expected = f"at most {DENSE} nodes, whose joint covariance it follows (freeze it, or intersect)"
             raise fail(f"fusion {name!r} between neighbours by {kind}", expected, nodes)
     return {name: mesh_of(network, name) for name in network.meshes}

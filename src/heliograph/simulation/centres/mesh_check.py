@@ -1,26 +1,27 @@
 """Checks of a fusion between neighbours when its network is made, and its claim."""
 
 import warnings
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_flow
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
-from heliograph.fusion.mesh.rules import FrozenWeights
+from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
 from heliograph.fusion.quantizer import UniformQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import fail, instance, of_each
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
-from heliograph.simulation.centres.edges import edges_of, loss_rate
+from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
+from heliograph.simulation.centres.mesh_decay import check_decay
 from heliograph.simulation.node import Node
 
 if TYPE_CHECKING:
@@ -43,16 +44,17 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     if unknown := sorted(set(neighbours) - set(network.nodes)):
         raise fail(what, f"nodes of the network {list(network.nodes)[:5]}", f"unknown ones {unknown[:5]}")
     if network.relays is not None or network.common is not None:
-        kind = "relays" if network.relays is not None else "nodes that share a channel: stack their measurements"
+        sharing = [node for node in network.mesh_nodes(name) if network.nodes[node].received][:5]
+        kind = "relays" if network.relays is not None else f"{sharing}, which share a channel: stack their measurements"
         raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", kind)
     if not isinstance(first(network.plant), LinearPlant):
         raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
     # Nodes have the filter or no sensor, and names of their own for the result.
     for node in network.mesh_nodes(name):
-        item = network.nodes[node]
-        if isinstance(item, Node) and fusion.filter not in item.filters:
-            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(item.filters) or "none")
-        if name in item.filters:
+        here = network.nodes[node]
+        if isinstance(here, Node) and fusion.filter not in here.filters:
+            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(here.filters) or "none")
+        if name in here.filters:
             raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
     _check_rule(what, fusion, network)
     graph = graph_of(neighbours, network.mesh_nodes(name))
@@ -61,21 +63,23 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     mesh_claim(name, fusion, network)
     _check_seen(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
+    _check_fixed(what, fusion, network, graph)
 
 
 def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
-    Weaker where laws are known up to a radius, weights are frozen means over losses, or a sender decides by what it
-    measured.
+    Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
+    sender by what it measured, a quantizer by what it cannot send.
     """
-    parts = {node: (item.sensor, item.channel, item.filters[fusion.filter])
+    parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
              for node in network.mesh_nodes(name)
-             if isinstance(item := network.nodes[node], Node)}  # fmt: skip
+             if isinstance(n := network.nodes[node], Node)}  # fmt: skip
     known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
-    senders = [item for node in network.mesh_nodes(name) if isinstance(item := network.nodes[node], Node)]
-    if isinstance(fusion.rule, FrozenWeights) or any(item.trigger is not None for item in senders):
-        return "nominal"
+    senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
+    by_data = fusion.quantizer is not None or any(n.trigger is not None for n in senders)
+    if by_data or isinstance(fusion.rule, FrozenWeights):
+        return weakest([known, "nominal"])
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
@@ -114,9 +118,8 @@ def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph)
         raise fail(what, expected, "events" if fusion.rounds == 1 else f"{fusion.rounds} rounds")
     if fusion.quantizer is not None:
         fusion.check(graph.nodes, len(network.states))
-        several = fusion.quantizer.values() if isinstance(fusion.quantizer, Mapping) else [fusion.quantizer]
-        for item in several:
-            instance("quantizer between neighbours", item, UniformQuantizer, "one with a bound on its error whatever "
+        for lossy in of_each("quantizers", fusion.quantizer, graph.nodes):
+            instance("quantizer between neighbours", lossy, UniformQuantizer, "one with a bound on its error whatever "
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
 
@@ -128,8 +131,8 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     nodes = network.mesh_nodes(name)
     sensors = [network.nodes[node] for node in nodes]
     observations = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
-    varying = [item for pair in observations for item in pair] + [network.plant]
-    if any(isinstance(item, OverTime) for item in varying):
+    varying = [model for pair in observations for model in pair] + [network.plant]
+    if any(isinstance(model, OverTime) for model in varying):
         return
     # Matrices that do not vary.
     a = np.asarray(first(network.plant).matrix)
@@ -137,12 +140,11 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
     refuse_angles(what, network.plant, *(sensor for sensor, _ in observations))
     # Squares H'H of each node's mean gain, and their sums over those upstream.
     squares = np.zeros((len(nodes), n, n))
-    for i, item in enumerate(sensors):
-        if isinstance(item, Node):
-            h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(item.sensor))
-            squares[i] = h.T @ h
-            noise = np.asarray(first(item.sensor).noise.covariance)
-            _check_regular(f"{what}: node {nodes[i]!r}", noise, item)
+    for i, sensor in enumerate(sensors):
+        if isinstance(sensor, Node):
+            h, noise = _model(sensor)
+            squares[i] = _scaled(h).T @ _scaled(h)
+            _check_regular(f"{what}: node {nodes[i]!r}", noise)
     # Modes of the plant, unstable and decaying, that nobody upstream of a node observes.
     unseen: dict[bool, list[str]] = {True: [], False: []}
     values = np.linalg.eigvals(a)
@@ -172,7 +174,7 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
     link, names = fusion.link, graph.nodes
     if link is None or len(names) > CUTS or isinstance(first(network.plant), OverTime):
         return
-    rates = [loss_rate(link[f"{names[j]} to {names[i]}"] if isinstance(link, dict) else link) for j, i in graph.edges]
+    rates = [loss_rate(channel) for channel in edge_links(link, graph).values()]
     if any(rate is None for rate in rates):
         return
     # Capacities -log p in whole units; those that are never cut get more than all others together.
@@ -196,23 +198,22 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
                            f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip
 
 
-def _sees(item: object, vector: np.ndarray) -> bool:
+def _sees(node: object, vector: np.ndarray) -> bool:
     """Test whether a node's own measurement shows a mode."""
-    if not isinstance(item, Node):
+    if not isinstance(node, Node):
         return False
-    h = _scaled(np.asarray(second_order(arrived(first(item.channel))).mean_gain) @ _matrix(first(item.sensor)))
-    return bool(np.any(np.abs(h @ vector) > RANK))
+    return bool(np.any(np.abs(_scaled(_model(node)[0]) @ vector) > RANK))
 
 
 def _unseen(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> set[bool]:
     """Test which modes these squares of outputs do not show: True where some does not decay, False where some does."""
     size = np.linalg.norm(a, 2) or 1.0
-    result = set()
+    hidden = set()
     for value in values:
         both = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
         if np.linalg.svd(both, compute_uv=False)[-1] < RANK:
-            result.add(bool(abs(value) >= 1 - MODE))
-    return result
+            hidden.add(bool(abs(value) >= 1 - MODE))
+    return hidden
 
 
 def _scaled(h: np.ndarray) -> np.ndarray:
@@ -221,16 +222,41 @@ def _scaled(h: np.ndarray) -> np.ndarray:
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
-def _matrix(sensor: object) -> np.ndarray:
+def _model(node: Node) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix of what a node receives of the state, and the covariance of the noise that no signal adds to."""
+    sensor, channel = first(node.sensor), second_order(arrived(first(node.channel)))
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
-    return np.asarray(sensor.matrix)
-
-
-def _check_regular(where: str, noise: np.ndarray, item: Node) -> None:
-    """Refuse a measurement without noise in some direction: its information has no number."""
-    channel = second_order(arrived(first(item.channel)))
     gain = np.asarray(channel.mean_gain)
-    total = gain @ noise @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
-    scale = np.sqrt(np.maximum(np.diagonal(total), 0.0))
-    if np.any(scale == 0) or np.linalg.eigvalsh(total / np.outer(scale, scale))[0] < RANK:
+    noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
+    return gain @ np.asarray(sensor.matrix), noise
+
+
+def _check_regular(where: str, noise: np.ndarray) -> None:
+    """Refuse a measurement without noise in some direction: its information has no number."""
+    scale = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
+    if np.any(scale == 0) or np.linalg.eigvalsh(noise / np.outer(scale, scale))[0] < RANK:
         raise fail(where, "measurement noise in every direction", "a singular covariance")
+
+
+def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+    """Refuse fixed shares with which errors grow, where the plant does not decay and gains become steady."""
+    plant, link, names = network.plant, fusion.link, graph.nodes
+    if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:
+        return
+    a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(jnp.zeros(len(plant.inputs))))
+    items = [network.nodes[name] for name in names]
+    rates = [1.0] * len(graph.edges) if link is None else [arrival_chance(c) for c in edge_links(link, graph).values()]
+    arrival = np.array([p for p in rates if p is not None])
+    steady = all(_is_steady(n) for n in items if isinstance(n, Node))
+    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
+        return
+    models = [_model(n) if isinstance(n, Node) else (np.zeros((1, len(a))), np.eye(1)) for n in items]
+    squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
+    check_decay(what, graph, np.asarray(fusion.rule.placed(graph).shares).T, arrival, (a, q), squares)
+
+
+def _is_steady(node: Node) -> bool:
+    """Test whether a node's measurement is the same at every step, and no signal adds to its noise."""
+    if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
+        return False
+    return not np.any(np.asarray(second_order(arrived(node.channel)).nominal.center)[:, :, :-1, :-1])

@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import csr_array
 
-from heliograph.fusion.mesh.gains import transitions
+from heliograph.fusion.mesh.joint import blocks_of, congruence, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim
@@ -74,8 +74,8 @@ def _drawn(mesh: Mesh, key: jax.Array, steps: np.ndarray) -> jax.Array:
     def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         return mesh.edges.draw(state, key, k)
 
-    result: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
-    return result
+    drawn: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
+    return drawn
 
 
 def mesh_errors(
@@ -131,7 +131,7 @@ def errors_over_time(
     joint = np.tile(moments[1], (nodes, nodes))
     follows = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
-        blocks = blocks_of(joint, mesh.senders) if follows else None
+        blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if follows else None
         with jax.enable_x64(True):
             parts = to_numpy(_parts(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
         joint = moved(mesh, joint, parts, arrived)
@@ -151,59 +151,21 @@ def _parts(
 
 def moved(mesh: Mesh, joint: np.ndarray, parts: Parts, arrived: np.ndarray) -> np.ndarray:
     """Joint covariance (N, N) after a step."""
-    gains, motion = parts.gains, parts.motion
-    nodes, n = len(mesh.senders), len(motion.shift)
+    gains, present, senders = parts.gains, mesh.edges.present, mesh.senders
     # Rounds that only intersect: e_i + sum_j C_ij (e_j - e_i).
     for number, weights in enumerate(parts.exchanges):
         held = np.where(arrived[:, number, :, None, None], weights.front[:, None] @ weights.parts, 0.0)
-        held[:, 0] = np.eye(n) - held[:, 1:].sum(axis=1)
-        joint = congruence(spread(mesh, held, mesh.edges.present), joint)
-    # M J M'.
-    with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, motion.matrix))))
-    result = congruence(spread(mesh, m, mesh.edges.present), joint)
-    # F Q F', and K_il R_l K_jl' = W_i S_l W_j' over the measurements that both have.
-    f = np.asarray(gains.innovation).reshape(nodes * n, n)
-    result += f @ motion.noise @ f.T
-    result += _noise(mesh, parts, arrived)
-    return np.asarray((result + result.T) / 2)
-
-
-def _noise(mesh: Mesh, parts: Parts, arrived: np.ndarray) -> np.ndarray:
-    """sum_l K_il R_l K_jl' of all pairs (N, N)."""
-    nodes = len(mesh.senders)
-    w, s = np.asarray(parts.gains.gain), np.asarray(parts.data.information)
-    n = w.shape[-1]
-    if mesh.edges.rounds == 1:
-        held = np.where(arrived[:, 0, :, None, None], w[:, None], 0.0)
-        left = spread(mesh, held @ s[mesh.senders], mesh.edges.present)
-        right = spread(mesh, held, mesh.edges.present)
-        return np.asarray((left @ right.T).todense())
-    known = np.asarray(mesh.known(arrived)).astype(float)
-    k = np.einsum("ij,iab->iajb", known, w)
-    both = np.einsum("iajb,jbc->iajc", k, s).reshape(nodes * n, nodes * n)
-    return np.asarray(both @ k.reshape(nodes * n, nodes * n).T)
-
-
-def spread(mesh: Mesh, blocks: np.ndarray, present: np.ndarray) -> Any:
-    """Sparse matrix (N, N) with these blocks (node, degree, n, n) at each node's neighbours."""
-    nodes, n = len(blocks), blocks.shape[-1]
-    ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    parts = np.ascontiguousarray(blocks[present]), mesh.senders[present], ends
-    return bsr_array(parts, shape=(nodes * n, nodes * n), blocksize=(n, n))
-
-
-def congruence(m: Any, joint: np.ndarray) -> np.ndarray:
-    """M J M' of a sparse M and a symmetric J."""
-    return np.asarray(m @ np.ascontiguousarray((m @ joint).T))
-
-
-def blocks_of(joint: np.ndarray, senders: np.ndarray) -> np.ndarray:
-    """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
-    nodes = len(senders)
-    n = len(joint) // nodes
-    whole = joint.reshape(nodes, n, nodes, n)
-    return np.moveaxis(whole[senders[:, :, None], :, senders[:, None], :], 3, 2)
+        held[:, 0] = np.eye(held.shape[-1]) - held[:, 1:].sum(axis=1)
+        joint = np.asarray(congruence(spread(held, senders, present), joint))
+    m = spread(transitions(gains, parts.motion.matrix), senders, present)
+    # Measurements of neighbours, or of all whose measurement a node has after all rounds.
+    there = arrived[:, 0] & present
+    if mesh.edges.rounds > 1:
+        there = np.asarray(mesh.known(arrived))
+        senders = np.broadcast_to(np.arange(len(there)), there.shape)
+    measured = used(gains.gain, there)
+    ws, w = (spread(x, senders, there) for x in (measured @ parts.data.information[senders], measured))
+    return np.asarray(joint_after(joint, m, gains.innovation, parts.motion.noise, ws, w))
 
 
 def best_possible(
@@ -246,13 +208,13 @@ def best_possible(
         s = np.asarray(steps[k].data.information)
         information.append((known @ s.reshape(count, -1)).reshape(s.shape))
     # Riccati recursions of all nodes side by side, oldest measurement first.
-    result = np.array(start.covariance)
+    covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        predicted = a @ result @ a.T + model.motion.noise
-        result = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
-        result = (result + result.swapaxes(1, 2)) / 2
-    return result
+        predicted = a @ covariance @ a.T + model.motion.noise
+        covariance = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
+        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+    return covariance
 
 
 @quickly_compiled
@@ -272,9 +234,9 @@ def _reached(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
-    result = known @ step
-    result.data = np.minimum(result.data, 1)
-    return result
+    reached = known @ step
+    reached.data = np.minimum(reached.data, 1)
+    return reached
 
 
 def freeze(
@@ -300,21 +262,22 @@ def freeze(
         ValueError: no such fusion, one by another rule, more steps to average than there are.
     """
     mesh = mesh_named(network, fusion)
-    item = network.meshes[fusion]
-    if not item.rule.needs_joint:
-        raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(item.rule).__name__)
+    old = network.meshes[fusion]
+    if not old.rule.needs_joint:
+        raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(old.rule).__name__)
     flags = _flags(mesh, arrived)
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
     u = inputs_of(network, inputs, len(flags))
     total: np.ndarray | None = None
+    shape = (len(mesh.nodes), len(network.states)) * 2
     for k, (joint, _, _) in enumerate(errors_over_time(mesh, flags, u)):
         # Blocks before a step are what its weights are made from.
         if k >= len(flags) - last:
-            blocks = blocks_of(joint, mesh.senders)
+            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             total = blocks if total is None else total + blocks
     assert total is not None
-    frozen = Fusion(item.filter, FrozenWeights(item.rule, total / last), neighbours=item.neighbours, link=item.link)
+    frozen = Fusion(old.filter, FrozenWeights(old.rule, total / last), neighbours=old.neighbours, link=old.link)
     return Network(network.plant, network.nodes, {**network.fused, **network.meshes, fusion: frozen})
 
 
@@ -340,5 +303,5 @@ def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds de
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    result: np.ndarray = flags & mesh.edges.present[:, None]
-    return result
+    arrives: np.ndarray = flags & mesh.edges.present[:, None]
+    return arrives

@@ -16,17 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.mesh.gains import Gains, transitions
+from heliograph.fusion.mesh.gains import Gains
 from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.joint import blocks_of, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.model.channel import Channel
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
-from heliograph.simulation.centres.edges import arrival_chance
+from heliograph.simulation.centres.edges import arrival_chance, edge_links
 from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
-from heliograph.simulation.centres.mesh_errors import MeshErrors, blocks_of, congruence, mesh_named, models, spread
+from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
 from heliograph.simulation.network import Network
 
 NODES, DEGREE = 200, 10  # of which patterns are listed
@@ -63,22 +64,23 @@ def mean_mesh_errors(
             neighbours.
     """
     mesh = mesh_named(network, fusion)
-    item = network.meshes[fusion]
-    if not (item.rule.needs_joint or isinstance(item.rule, FrozenWeights)):
+    between = network.meshes[fusion]
+    if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
         expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
-        raise fail(f"mean errors of fusion {fusion!r}", expected, type(item.rule).__name__)
+        raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
     # Probability of each pattern of arrivals.
     network.check_horizon(check_count("horizon", horizon))
     u = inputs_of(network, inputs, horizon)
     names = mesh.nodes
-    chances = [_known(item.link, f"{sender} to {names[i]}")
-               for i in range(len(names)) for sender in (item.neighbours or {})[names[i]]]  # fmt: skip
+    graph = graph_of(between.neighbours or {}, names)
+    links = {} if between.link is None else edge_links(between.link, graph)
+    chances = [_known(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _patterns(mesh, np.array(chances))
     # A row of the mesh for each pattern of each node.
-    rule = item.rule.placed(graph_of(item.neighbours or {}, names))
+    rule = between.rule.placed(graph)
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    part = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
-    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (part,)))
+    bucket = Rows(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    rows = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     # Joint errors, step after step, averaged over the patterns.
@@ -87,7 +89,8 @@ def mean_mesh_errors(
     for k, u_k in enumerate(u):
         with jax.enable_x64(True):
             step = to_numpy(models(mesh, start.covariance, moments, u_k, np.asarray(k)))
-            blocks = blocks_of(joint, mesh.senders)
+            shape = (len(names), len(network.states)) * 2
+            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
             gains = to_numpy(_gains(rows, covariance, blocks, patterns, step))
         joint, moments = _mean(mesh, joint, blocks, patterns, gains, step), step.plant
         n = len(step.motion.shift)
@@ -117,25 +120,21 @@ def _mean(
         return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
 
     # Gains of every pattern, M_i with the node itself first.
-    with jax.enable_x64(True):
-        m = to_numpy(transitions(*jax.tree.map(jnp.asarray, (gains, step.motion.matrix))))
-    f, w = np.asarray(gains.innovation), np.where(patterns.present[:, :, None, None], gains.gain[:, None], 0.0)
+    m, f = np.asarray(transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
+    w = np.asarray(used(gains.gain, patterns.present))
     # Different receivers: products of means.
-    result = congruence(spread(mesh, mean(m), mesh.edges.present), joint)
-    f_mean = mean(f).reshape(count * n, n)
-    result += f_mean @ q @ f_mean.T
     held = mean(w)
-    left = spread(mesh, held @ s[mesh.senders], mesh.edges.present)
-    result += (left @ spread(mesh, held, mesh.edges.present).T).toarray()
+    everywhere = [spread(x, mesh.senders, mesh.edges.present) for x in (mean(m), held @ s[mesh.senders], held)]
+    after = joint_after(joint, everywhere[0], mean(f), q, *everywhere[1:])
     # One receiver: the mean over its patterns.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
     noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
     same = mean(flat @ inside @ flat.swapaxes(1, 2) + f @ q @ f.swapaxes(1, 2) + noise)
-    whole = result.reshape(count, n, count, n)
+    whole = after.reshape(count, n, count, n)
     items = np.arange(count)
     whole[items, :, items, :] = same
-    return np.asarray((result + result.T) / 2)
+    return np.asarray(after)
 
 
 def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
@@ -157,11 +156,10 @@ def _patterns(mesh: Mesh, chances: np.ndarray) -> Patterns:
     return Patterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
 
 
-def _known(link: Channel | dict[str, Channel] | None, edge: str) -> float:
+def _known(edge: str, link: Channel) -> float:
     """Probability that a message of this edge arrives, at every step the same and drawn anew."""
-    channel = link[edge] if isinstance(link, dict) else link
-    chance = arrival_chance(channel)
+    chance = arrival_chance(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
-        raise fail(f"mean errors: link {edge!r}", expected, type(channel).__name__)
+        raise fail(f"mean errors: link {edge!r}", expected, type(link).__name__)
     return chance

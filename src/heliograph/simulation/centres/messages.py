@@ -21,7 +21,7 @@ from heliograph.numerics.types import Bool, Float, Int
 class OnTheWay(NamedTuple):
     """Estimates of the state that messages sent 1, 2, ... steps ago give now, by the node that sent them.
 
-    Shapes: mean (age, node, n), covariance (age, node, n, n).
+    Shapes: mean (age, node, n), NaN of what saturated its quantizer; covariance (age, node, n, n).
     """
 
     mean: Float[jax.Array, "age node n"]
@@ -32,7 +32,7 @@ class Messages(NamedTuple):
     """Estimates of the nodes and, after them, those that messages bring, by age and node; which of them a node has.
 
     Shapes: mean (row, n), covariance (row, n, n); senders (node, degree), rows of the node itself and of the messages;
-    arrives and fresh (node, rounds, degree): messages that arrive, and those of them of this step.
+    arrives and fresh (node, rounds, degree): estimates that arrive, and measurements of this step that do.
     """
 
     mean: Float[jax.Array, "row n"]
@@ -56,26 +56,36 @@ def moved_beyond(
     return jnp.zeros(len(off), dtype=bool).at[senders[:, 1:]].max(moving)
 
 
+def quantized(
+    quantizer: AbstractQuantizer, mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"]
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
+    """Return what a node sends of an estimate: quantized, and wider; NaN where it is beyond the amplitude."""
+    value = quantizer.step((), mean)[1]
+    received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)
+    return received, widen(covariance, jnp.asarray(quantizer.error(len(mean))))
+
+
 def messages_of(
     mean: jax.Array, covariance: jax.Array, way: OnTheWay, quantizer: AbstractQuantizer | None, senders: np.ndarray,
     ages: Int[jax.Array, "node rounds degree"],
 ) -> Messages:  # fmt: skip
     """Return what arrives at a step: `ages` of the messages, -1 where none does.
 
-    A value that saturates its quantizer is an infinite number: nothing is known of it, and the estimates show that.
+    An estimate that saturates its quantizer did not arrive, however late; the measurement sent with it arrives at once
+    or not at all. So data decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
     """
     sent = mean, covariance
     if quantizer is not None:
-        both = eqx.filter_vmap(lambda q, x: q.step((), x)[1], in_axes=(eqx.if_array(0), 0))(quantizer, mean)
-        error = eqx.filter_vmap(lambda q: q.error(mean.shape[-1]), in_axes=(eqx.if_array(0),))(quantizer)
-        beyond = jnp.any(both.saturated, axis=1, keepdims=True)
-        sent = jnp.where(beyond, jnp.inf, both.value), jax.vmap(widen)(covariance, error)
+        sent = eqx.filter_vmap(quantized, in_axes=(eqx.if_array(0), 0, 0))(quantizer, *sent)
     means, covariances = (
-        jnp.concatenate([alone, now, part.reshape(-1, *alone.shape[1:])])
-        for alone, now, part in zip((mean, covariance), sent, way, strict=True)
+        jnp.concatenate([alone, now, late.reshape(-1, *alone.shape[1:])])
+        for alone, now, late in zip((mean, covariance), sent, way, strict=True)
     )
     rows = jnp.asarray(senders) + len(mean) * (1 + jnp.maximum(ages[:, -1], 0))
-    return Messages(means, covariances, rows.at[:, 0].set(senders[:, 0]), ages >= 0, ages == 0)
+    # In place of an estimate that did not arrive a node's own, which is a number.
+    without = jnp.any(jnp.isnan(means), axis=1)[rows]
+    rows = jnp.where(without, senders[:, :1], rows).at[:, 0].set(senders[:, 0])
+    return Messages(means, covariances, rows, (ages >= 0) & ~without.at[:, 0].set(False)[:, None], ages == 0)
 
 
 def one_step_on(

@@ -14,6 +14,7 @@ from jax.scipy.linalg import block_diag
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
+from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -22,6 +23,7 @@ from heliograph.numerics.types import Array, ArrayLike
 from heliograph.simulation.centres.centre import Apart, observation_model
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
+from heliograph.simulation.centres.messages import OnTheWay, quantized
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
@@ -44,12 +46,14 @@ class NodeFilter(AbstractSizedFilter):
     mesh: Mesh
     measured: tuple[int, ...] = eqx.field(static=True)  # numbers of each sensor, the node's first
     receivers: tuple[str, ...] = eqx.field(static=True)  # nodes that receive this one's messages
+    quantizer: AbstractQuantizer | None  # of its messages
 
     @in_float64
     def init(self) -> NodeState:
         """Return the plant's initial law."""
         start = self.mesh.init()
-        alone = start._replace(mean=start.mean[:1], covariance=start.covariance[:1])
+        n, count = start.mean.shape[1], len(self.measured)
+        alone = start._replace(way=OnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
         return NodeState(alone, jnp.zeros(len(self.inputs)), alone)
 
     @predicts
@@ -62,12 +66,12 @@ class NodeFilter(AbstractSizedFilter):
         """Fuse, predict and correct with what came; innovations of the measurements about the node's prediction."""
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _, _ = self._parts(jnp.asarray(z), state.before)
+        sensed, _ = self._parts(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return self._after(state.before, jnp.asarray(z), state.inputs, k), no_innovation()
-        gain, offset = (jnp.concatenate([part[i, :size] for i, size in sensors])
-                        for part in (observation.gain, observation.offset))  # fmt: skip
+        gain, offset = (jnp.concatenate([stacked[i, :size] for i, size in sensors])
+                        for stacked in (observation.gain, observation.offset))  # fmt: skip
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
         total = gain @ covariance @ gain.T + noise
         innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
@@ -78,26 +82,30 @@ class NodeFilter(AbstractSizedFilter):
         """Mean and covariance of the node."""
         return Estimate(jnp.asarray(state.now.mean)[0], jnp.asarray(state.now.covariance)[0], self.claim)
 
-    def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState, jax.Array]:
-        """Measurements of node and neighbours, their estimates, and whose message came."""
+    @in_float64
+    def sent(self, before: MeshState) -> tuple[jax.Array, jax.Array]:
+        """Mean (n,) and covariance (n, n) in a message about the estimate before a step, quantized where it is."""
+        message = jnp.asarray(before.mean)[0], jnp.asarray(before.covariance)[0]
+        return message if self.quantizer is None else quantized(self.quantizer, *message)
+
+    def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
+        """Measurements of node and neighbours, and their estimates, of mean NaN where none came."""
         n, at_place = len(self.states), self.measured[0]
-        sensed, means, covariances, came = [z[:at_place]], [before.mean[0]], [before.covariance[0]], [jnp.asarray(True)]
+        sensed, means, covariances = [z[:at_place]], [before.mean[0]], [before.covariance[0]]
         for size in self.measured[1:]:
             mean, rest = z[at_place : at_place + n], z[at_place + n : at_place + n + n * n]
             at_place += n + n * n + size
             sensed.append(z[at_place - size : at_place])
             # A message without an estimate is none: any regular covariance does for it.
-            arrives = ~(jnp.any(jnp.isnan(mean)) | jnp.any(jnp.isnan(rest)))
-            means.append(jnp.where(arrives, mean, means[0]))
+            arrives = ~jnp.any(jnp.isnan(rest))
+            means.append(jnp.where(arrives, mean, jnp.nan))
             covariances.append(jnp.where(arrives, symmetrize(rest.reshape(n, n)), covariances[0]))
-            came.append(arrives)
-        return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances)), jnp.stack(came)
+        return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _after(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
-        sensed, all_nodes, came = self._parts(z, before)
-        now, _ = self.mesh.step(
-            all_nodes, [part[None] for part in sensed], came[None, None], jnp.asarray(u), jnp.asarray(k)
-        )
+        sensed, all_nodes = self._parts(z, before)
+        everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
+        now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
         return NodeState(before, u, now)
 
 
@@ -105,18 +113,20 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """Filter of a node of the fusion `fusion` between neighbours of `network`, on what its neighbours send.
 
     Raises:
-        ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events.
+        ValueError: a rule that needs the joint covariance of all nodes' errors, more than one round, events, a plant
+            whose steps are of any length.
     """
-    item, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
+    between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     what = f"node {node!r} of fusion {fusion!r} by itself"
-    if item.rule.needs_joint:
+    if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
-                   type(item.rule).__name__)  # fmt: skip
-    if item.rounds > 1 or item.alpha is not None or item.quantizer is not None:
-        different = "several rounds" if item.rounds > 1 else "a quantizer" if item.alpha is None else "events"
-        raise fail(what, "one exchange a step", different)
+                   type(between.rule).__name__)  # fmt: skip
+    if between.rounds > 1 or between.alpha is not None:
+        raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
+    if "dt" in network.inputs:
+        raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
     # The node's row of the graph: itself, then its neighbours.
-    graph, neighbours = graph_of(item.neighbours or {}, nodes), item.neighbours or {}
+    graph, neighbours = graph_of(between.neighbours or {}, nodes), between.neighbours or {}
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, graph.senders[i : i + 1, :count], np.ones((1, count), dtype=bool))
     names = (node, *neighbours[node])
@@ -125,7 +135,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     sizes = tuple(n.received for n in sensors)
     mesh = Mesh(
         plant=network.plant,
-        buckets=(Rows(item.rule.placed(row), np.zeros(1, dtype=int), count),),
+        buckets=(Rows(between.rule.placed(row), np.zeros(1, dtype=int), count),),
         ranks=np.zeros(1, dtype=int),
         edges=Edges((), np.zeros(0, dtype=int), row.present, 1),
         observation_model=Apart(tuple(models), np.arange(count), max(1, *sizes), (1,) * count),
@@ -140,6 +150,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     return NodeFilter(
         mesh=mesh,
         measured=sizes,
+        quantizer=next(iter(between.quantizers((node,))), None),
         receivers=tuple(name for name in nodes if node in neighbours[name]),
         claim=mesh.claim,
         states=network.states,

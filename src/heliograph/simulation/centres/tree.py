@@ -124,15 +124,15 @@ def relay_tree(
                 return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(level_covariances), tuple(used))
             groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(level_covariances[-1]), degree)]
             outputs = [to_numpy(_relay(group)) for group in groups]
-            used.append(np.stack([_padded(item, degree) for item, _ in outputs]))
-            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in outputs))
+            used.append(np.stack([_padded(relay_weights, degree) for relay_weights, _ in outputs]))
+            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(relay for _, relay in outputs))
 
 
 class Level(NamedTuple):
-    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = local_i."""
+    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = independent_i."""
 
     shared: Float[Array, "node n sources"]
-    local: Float[Array, "node n n"]
+    independent: Float[Array, "node n n"]
 
 
 @quickly_compiled
@@ -144,7 +144,7 @@ def _followed(
     # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
-    channels = eqx.filter_vmap(lambda item: described(node(item).channel))(numbers)
+    channels = eqx.filter_vmap(lambda values: described(node(values).channel))(numbers)
     alike = Alike(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
     observe = Apart((ObservationModel(nodes.sensor, channels),), np.arange(count), size)
@@ -155,13 +155,13 @@ def _followed(
     state = alike.init()
     n = len(first(plant).states)
     begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
-    result = centre.factors(
+    factors = centre.factors(
         (state, begin),
-        lambda local, u_k, k: alike.matrices(centre.read, local, 0, quiet, u_k, k),
-        lambda local, u_k, k: alike.step(local, quiet, u_k, k)[0],
+        lambda states, u_k, k: alike.matrices(centre.read, states, 0, quiet, u_k, k),
+        lambda states, u_k, k: alike.step(states, quiet, u_k, k)[0],
         u,
     )
-    level = Level(result.shared, result.local)
+    level = Level(factors.shared, factors.independent)
     # Full relays at once, then the last one.
     full = count - count % degree
     weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
@@ -180,14 +180,14 @@ def _relay(children: Level) -> tuple[jax.Array, Level]:
 
 
 def _fuse(children: Level) -> tuple[jax.Array, Level]:
-    shared, local = jnp.asarray(children.shared), jnp.asarray(children.local)
-    weights = matrix_weights(joint_of(shared, local))
-    return weights, Level(*weighted_sources(weights, shared, local))
+    shared, independent = jnp.asarray(children.shared), jnp.asarray(children.independent)
+    weights = matrix_weights(joint_of(shared, independent))
+    return weights, Level(*weighted_sources(weights, shared, independent))
 
 
 def _spread(level: Level) -> Array:
     """Covariance of each error."""
-    return level.shared @ level.shared.swapaxes(-1, -2) + level.local
+    return level.shared @ level.shared.swapaxes(-1, -2) + level.independent
 
 
 def _joined(levels: list[Level]) -> Level:

@@ -94,8 +94,8 @@ class Uplinks(Module):
         for group in self.groups:
             places = jnp.asarray(group.places)
 
-            def single(channel: Channel, place: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-                drawn, late = jax.random.split(draw_key(key, k, place, CHANNEL))
+            def single(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+                drawn, late = jax.random.split(draw_key(key, k, source, CHANNEL))
                 return at(channel, k).sample(drawn), jax.random.choice(late, len(law), p=law)
 
             both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0))
@@ -122,26 +122,26 @@ class Uplinks(Module):
         """
         count, m = len(self.received), max(self.received)
         if reports is None and not self.groups:
-            return Drawn(*(np.broadcast_to(part, (steps, *np.shape(part))) for part in self.undrawn()))
+            return Drawn(*(np.broadcast_to(values, (steps, *np.shape(values))) for values in self.undrawn()))
         if reports is None or set(reports) != set(nodes):
-            result = "none" if reports is None else list(reports)
-            raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", result)
+            got = "none" if reports is None else list(reports)
+            raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", got)
         # Received values as offsets, with gains of zero.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
-            sent, local = reports[node], self.received[i]
+            sent, size = reports[node], self.received[i]
             if isinstance(sent, SentReports):
                 delay[:, i] = self._checked_delay(f"delays of node {node!r}", sent.delay, steps, i)
                 sent = sent.values
-            values[:, i, :local] = array(f"reports of node {node!r}", sent, (steps, local), missing=True)
+            values[:, i, :size] = array(f"reports of node {node!r}", sent, (steps, size), missing=True)
         return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _checked_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
-        result: np.ndarray = array(name, value, (steps,))
+        delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
-        if not np.all(np.isin(result, possible)):
-            raise fail(name, f"each one of {possible.tolist()} steps", sorted(set(result.tolist())))
-        return result.astype(int)
+        if not np.all(np.isin(delays, possible)):
+            raise fail(name, f"each one of {possible.tolist()} steps", sorted(set(delays.tolist())))
+        return delays.astype(int)
 
     @property
     def fixed_delay(self) -> jax.Array:
@@ -162,8 +162,8 @@ class Uplinks(Module):
         beyond = jnp.zeros(len(means), dtype=bool)
         # Quantized reports; an infinite number stands for one that saturated.
         if self.quantizers is not None:
-            item = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
-            quantizers, sent = item(self.quantizers, state.quantizers, values)
+            quantize = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
+            quantizers, sent = quantize(self.quantizers, state.quantizers, values)
             state, values = state._replace(quantizers=quantizers), sent.value
             beyond = jnp.any(sent.saturated, axis=1)
             traffic = {"saturated": sent.saturated, "symbols": jnp.where(sending, sent.symbols, 0)}
@@ -202,17 +202,17 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 
 def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
     """Model of the uplinks for a centre, at each step if any varies."""
-    varying = [item.steps for item in known if isinstance(item, OverTime)]
+    varying = [link.steps for link in known if isinstance(link, OverTime)]
     if not varying:
         return _links(known, received, error)
-    return over_time([_links([at(item, k) for item in known], received, error) for k in range(min(varying))])
+    return over_time([_links([at(link, k) for link in known], received, error) for k in range(min(varying))])
 
 
 def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
-    more = [(0, max(received) - item) for item in received]
-    gain = np.stack([np.pad(item.mean_gain, (a, (0, 0))) for item, a in zip(known, more, strict=True)])
-    offset = np.stack([np.pad(item.offset, a) for item, a in zip(known, more, strict=True)])
-    spread = [np.pad(item.nominal.center, (a, a, (0, 0), (0, 0))) for item, a in zip(known, more, strict=True)]
+    more = [(0, max(received) - size) for size in received]
+    gain = np.stack([np.pad(link.mean_gain, (a, (0, 0))) for link, a in zip(known, more, strict=True)])
+    offset = np.stack([np.pad(link.offset, a) for link, a in zip(known, more, strict=True)])
+    spread = [np.pad(link.nominal.center, (a, a, (0, 0), (0, 0))) for link, a in zip(known, more, strict=True)]
     return Links(gain, offset, np.stack(spread), error)
 
 

@@ -46,13 +46,13 @@ def diagram(network: "Network") -> list[Part]:
             words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {listed(network.nodes_with(fusion.filter))}"
         parts.append(Part(f"fused {name}", f"{words} ({claims[name]})"))
     parts += [Part("shared", words) for words in shared(network)]
-    return [Part(visible(part.name), visible(part.words)) for part in parts]
+    return [Part(visible(line.name), visible(line.words)) for line in parts]
 
 
 def _node(network: "Network", name: str) -> str:
     """Return what a node receives, through which hops, and its filters with their claims."""
     node, claims = network.nodes[name], network.claims()[name]
-    filters = ", ".join(f"{item} ({claim})" for item, claim in claims.items()) or "no filter of its own"
+    filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
     if isinstance(node, Node):
         return ARROW.join([", ".join(node.outputs), link_in_words(node.channel), filters])
     if network.common is not None:
@@ -76,10 +76,10 @@ def shared(network: "Network") -> list[str]:
     nodes: dict[int, list[str]] = {}
     names: dict[int, str] = {}
     for name, channel in channels.items():
-        for place, memory in zip(places[name].tolist(), memories(channel).values(), strict=True):
-            nodes.setdefault(place, []).append(name)
-            names[place] = type(memory).__name__ if memory.name is None else repr(memory.name)
-    return [f"fading {names[place]}: {listed(of)}" for place, of in nodes.items() if len(of) > 1]
+        for row, memory in zip(places[name].tolist(), memories(channel).values(), strict=True):
+            nodes.setdefault(row, []).append(name)
+            names[row] = type(memory).__name__ if memory.name is None else repr(memory.name)
+    return [f"fading {names[row]}: {listed(of)}" for row, of in nodes.items() if len(of) > 1]
 
 
 def listed(names: Sequence[str]) -> str:
@@ -104,8 +104,8 @@ def short_text_of(network: "Network") -> str:
 
 def _lines(network: "Network") -> list[str]:
     parts = diagram(network)
-    width = max(len(part.name) for part in parts)
-    return [_title(network), *(f"{part.name:{width}}  {part.words}" for part in parts)]
+    width = max(len(line.name) for line in parts)
+    return [_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
 
 
 def _title(network: "Network") -> str:
@@ -115,8 +115,8 @@ def _title(network: "Network") -> str:
 def table_of(network: "Network") -> str:
     """Return the diagram as an HTML table, for notebooks."""
     rows = (
-        f'<tr><th style="text-align:left">{escape(part.name)}</th>'
-        f'<td style="text-align:left">{escape(part.words)}</td></tr>'
-        for part in diagram(network)
+        f'<tr><th style="text-align:left">{escape(line.name)}</th>'
+        f'<td style="text-align:left">{escape(line.words)}</td></tr>'
+        for line in diagram(network)
     )
     return f"<table><caption>{_title(network)}</caption>{''.join(rows)}</table>"

@@ -41,7 +41,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     """
     lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
-    return sorted(lines, key=lambda item: not item.serious)
+    return sorted(lines, key=lambda doubt: not doubt.serious)
 
 
 def _sensors(network: Network) -> list[AbstractSensor]:
@@ -64,7 +64,7 @@ def _unobservable(network: Network) -> Iterator[Doubt]:
     _, singular, right = np.linalg.svd(rows / columns)
     rank = int(np.sum(singular > HIDDEN * max(singular[0], 1e-300)))
     hidden = np.abs(right[rank:]).max(axis=0, initial=0.0) > np.sqrt(HIDDEN)
-    names = [repr(name) for name, part in zip(network.states, hidden, strict=True) if part]
+    names = [repr(name) for name, unseen in zip(network.states, hidden, strict=True) if unseen]
     if names:
         count = len(network.states) - rank
         what = names[0] if len(names) == 1 else f"{count} of the combinations of {', '.join(names)}"
@@ -111,15 +111,15 @@ def _unbounded(network: Network) -> Iterator[Doubt]:
 
 def _bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
     try:
-        result = certify_boundedness(network)
+        boundedness = certify_boundedness(network)
     except InputError as error:
         if serious:
             yield Doubt(False, f"boundedness: not judged ({error})")
         return
-    if result.verdict == "impossible":
-        yield Doubt(serious, f"unbounded: {what} grows without end: {result.reason}")
-    elif result.verdict == "undecided":
-        yield Doubt(False, f"boundedness of {what}: undecided: {result.reason}")
+    if boundedness.verdict == "impossible":
+        yield Doubt(serious, f"unbounded: {what} grows without end: {boundedness.reason}")
+    elif boundedness.verdict == "undecided":
+        yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
 def _forgotten(network: Network) -> Iterator[Doubt]:
@@ -133,11 +133,11 @@ def _forgotten(network: Network) -> Iterator[Doubt]:
             remembers = memory_matters(node.channel)
         except InputError:  # a memory that nothing is known of
             continue
-        for item, filter_ in node.filters.items() if remembers else ():
+        for label, filter_ in node.filters.items() if remembers else ():
             if _forgets(filter_):
-                nodes.setdefault(item, []).append(name)
-    for item, names in nodes.items():
-        words = f"ignored memory: {item!r} of {listed(names)} takes a link for one without memory"
+                nodes.setdefault(label, []).append(name)
+    for label, names in nodes.items():
+        words = f"ignored memory: {label!r} of {listed(names)} takes a link for one without memory"
         yield Doubt(True, f"{words}; linear_filter or mixture_filter of the link itself knows it")
 
 

@@ -49,7 +49,7 @@ def _words(channel: AbstractRandomAffine) -> str:
         case OfLine():
             return _words(channel.plain)
         case Modes():
-            alternatives = " or ".join(_words(part) or DIRECT for part in channel.maps)
+            alternatives = " or ".join(_words(affine) or DIRECT for affine in channel.maps)
             return f"{_memory(channel)}modes ({alternatives})"
         case Faded():
             return f"{_memory(channel)}drifting hop"
@@ -81,7 +81,7 @@ def _mixture(channel: Mixture) -> str:
     shares, parts = channel.choice.probabilities, [_words(affine) or DIRECT for affine in channel.maps]
     if len(parts) == 2 and parts[1] == "nothing sent":
         return f"{parts[0]}, {_percent(shares[1])} lost unnoticed"
-    return f"({' or '.join(f'{part} ({_percent(p)})' for part, p in zip(parts, shares, strict=True))})"
+    return f"({' or '.join(f'{words} ({_percent(p)})' for words, p in zip(parts, shares, strict=True))})"
 
 
 def _memory(channel: AbstractModal) -> str:

@@ -15,33 +15,33 @@ def reports_by_name(
     network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, dict[str, SentReports]]:
     """Reports by fusion and node, without a node's padding, from (..., node, m) and (..., node)."""
-    result: dict[str, dict[str, SentReports]] = {}
+    reports: dict[str, dict[str, SentReports]] = {}
     for name, (values, delay) in outcome.items():
         if name in network.meshes:
-            result[name] = _arrivals(network, name, np.asarray(values))
+            reports[name] = _arrivals(network, name, np.asarray(values))
             continue
         fusion = network.fused[name]
         assert isinstance(fusion, Fusion)  # no other rule uses reports
         nodes, n = network.nodes_with(fusion.filter), len(network.states)
         sizes = [link.received(n) for link in fusion.links(nodes)]
-        result[name] = {
+        reports[name] = {
             node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
             for i, node in enumerate(nodes)
         }
-    return result
+    return reports
 
 
 def _arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
     """Messages that arrived from each node's neighbours, 1 (or their ages) or NaN (..., rounds times neighbours)."""
     neighbours = network.meshes[name].neighbours or {}
-    result = {}
+    reports = {}
     for i, node in enumerate(network.mesh_nodes(name)):
         if count := len(neighbours[node]):
             flags = arrived[..., i, :, 1 : count + 1]
             ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
             values = ages.reshape(*flags.shape[:-2], -1)
-            result[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
-    return result
+            reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
+    return reports
 
 
 def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -66,12 +66,12 @@ def transmissions_of(network: Network, groups: dict[str, np.ndarray]) -> dict[st
 def weighed_of(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Innovations by component of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
-    result: dict[str, dict[str, Weighed]] = {}
+    weighed: dict[str, dict[str, Weighed]] = {}
     for (node, name), (kind, f, i) in network.places().items() if parts else ():
         if parts[kind] is not None:
-            result.setdefault(node, {})[name] = Weighed(*(np.asarray(part)[:, f, i] for part in parts[kind]))
-    central = {name: item for name, item in batch.get("weighed_centrally", {}).items() if item is not None}
-    return result | ({FUSED: central} if central else {})
+            weighed.setdefault(node, {})[name] = Weighed(*(np.asarray(columns)[:, f, i] for columns in parts[kind]))
+    central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
+    return weighed | ({FUSED: central} if central else {})
 
 
 def by_name(
@@ -81,23 +81,23 @@ def by_name(
 
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """
-    result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
+    by_node: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
     parts = batch["estimates"]
     kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
-    for (group, filters), part in zip(kinds, parts, strict=True):
-        values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
+    for (group, filters), estimate in zip(kinds, parts, strict=True):
+        values = np.moveaxis(read(estimate), (axis, axis + 1), (0, 1))
         for name, rows in zip(filters, values, strict=True):
             for node, row in zip(network.groups[group], rows, strict=True):
-                result[node][name] = row
+                by_node[node][name] = row
     if network.fused:
-        result[FUSED] = {name: read(part) for name, part in batch["fused"].items()}
-    return result
+        by_node[FUSED] = {name: read(estimate) for name, estimate in batch["fused"].items()}
+    return by_node
 
 
 def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
     """Uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
-    result = {}
+    uplinks = {}
     for name, fusion in network.fused.items() if outcome else ():
         if isinstance(fusion, Fusion) and name in outcome:
-            result[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **outcome[name])
-    return result
+            uplinks[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **outcome[name])
+    return uplinks

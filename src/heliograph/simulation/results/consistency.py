@@ -113,7 +113,7 @@ def _squared(
     filled = np.where(both, covariance, np.eye(n) * ~there[..., None, :])
     # The axis of steps last.
     parts = filled.reshape(-1, n, n), np.where(there, x, 0.0).reshape(-1, n), np.nan_to_num(size).reshape(-1, n)
-    first, *others = (np.moveaxis(part, 0, -1) for part in parts)
+    first, *others = (np.moveaxis(values, 0, -1) for values in parts)
     value = np.asarray(_distance(first, *others)).reshape(x.shape[:-1])
     # Each missing component added nothing: 0^2 / 1.
     return np.asarray(np.where(there.any(axis=-1), value, np.nan))

@@ -67,7 +67,7 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
     for i, (node, name, quantity, component, other) in enumerate(frame.columns):
         values = frame.iloc[:, i].to_numpy().reshape(lead)
         parts.setdefault((node, name, quantity), {})[component, other] = values
-    joined = {key: np.stack(list(part.values()), axis=-1) for key, part in parts.items()}
+    joined = {key: np.stack(list(columns.values()), axis=-1) for key, columns in parts.items()}
     # Sort them into truth, measurements, estimates and uplinks.
     states: tuple[str, ...] = ()
     measurements: dict[str, np.ndarray] = {}
@@ -88,8 +88,8 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
             estimates.setdefault(node, {})[name] = Estimate(mean, covariance, COVARIANCE[quantity])
     # Uplinks with their nodes side by side.
     uplinks = {
-        name: Uplink(tuple(item), *(np.stack(item, axis=-2) for item in zip(*item.values(), strict=True)))
-        for name, item in sent.items()
+        name: Uplink(tuple(by_node), *(np.stack(arrays, axis=-2) for arrays in zip(*by_node.values(), strict=True)))
+        for name, by_node in sent.items()
     }
     time = np.asarray(frame.index.get_level_values("time"))[:steps]
     return {
@@ -162,21 +162,21 @@ def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, 
 
 def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...], parts: Sequence[Part]) -> np.ndarray:
     """Arrays (*lead, *up to tail) at their places along axes between; NaN elsewhere."""
-    result = np.full((*lead, *places, *tail), np.nan)
+    arrays = np.full((*lead, *places, *tail), np.nan)
     ahead: tuple[slice, ...] = (slice(None),) * len(lead)
-    for place, values in parts:
-        where: Any = (*ahead, *place, *map(slice, values.shape[len(lead) :]))
-        result[where] = values
-    return result
+    for position, values in parts:
+        where: Any = (*ahead, *position, *map(slice, values.shape[len(lead) :]))
+        arrays[where] = values
+    return arrays
 
 
 def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
     """Claim of each filter, at its place; empty elsewhere."""
-    result = np.full(sizes, "", dtype="U7")
-    for place, item in outcome:
-        claim: Claim = item.claim
-        result[place] = claim
-    return result
+    claims = np.full(sizes, "", dtype="U7")
+    for position, estimate in outcome:
+        claim: Claim = estimate.claim
+        claims[position] = claim
+    return claims
 
 
 def uplink_variables(
@@ -188,18 +188,18 @@ def uplink_variables(
     # Places of the senders in each fusion, -1 for none.
     senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
     fusions, first = list(uplinks), next(iter(uplinks.values()))
-    place = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
-    parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *place.shape, n), getattr(first, name).dtype)
+    positions = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
+    parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *positions.shape, n), getattr(first, name).dtype)
              for name in ("saturated", "symbols")}  # fmt: skip
     # Values by fusion and sender.
     for i, uplink in enumerate(uplinks.values()):
         for j, node in enumerate(uplink.nodes):
-            place[i, senders.index(node)] = j
+            positions[i, senders.index(node)] = j
             for name, values in parts.items():
                 values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
     axes = [*lead, "fusion", "sender", "state"]
     named = {"fusion": (["fusion"], text(fusions)), "sender": (["sender"], text(senders))}
-    return {"place": (["fusion", "sender"], place), **{name: (axes, v) for name, v in parts.items()}, **named}
+    return {"place": (["fusion", "sender"], positions), **{name: (axes, v) for name, v in parts.items()}, **named}
 
 
 def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
@@ -208,16 +208,16 @@ def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
 
     if "place" not in dataset:
         return {}
-    senders, place = names_of(dataset, "sender"), values_of(dataset, "place", ["fusion", "sender"])
+    senders, positions = names_of(dataset, "sender"), values_of(dataset, "place", ["fusion", "sender"])
     saturated, symbols = (
         values_of(dataset, name, [*lead, "fusion", "sender", "state"]) for name in ("saturated", "symbols")
     )
-    result = {}
+    uplinks = {}
     for i, name in enumerate(names_of(dataset, "fusion")):
-        order = np.array([j for j in np.argsort(place[i], kind="stable") if place[i, j] >= 0], dtype=int)
+        order = np.array([j for j in np.argsort(positions[i], kind="stable") if positions[i, j] >= 0], dtype=int)
         nodes = tuple(senders[j] for j in order)
-        result[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])
-    return result
+        uplinks[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])
+    return uplinks
 
 
 def dataset_of(
@@ -253,15 +253,15 @@ def dataset_of(
 def claims_text(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Claims for people: `node/filter: claim`."""
     return visible(
-        ", ".join(f"{node}/{name}: {single.claim}" for node, item in results.items() for name, single in item.items())
+        ", ".join(f"{node}/{name}: {single.claim}" for node, of in results.items() for name, single in of.items())
     )
 
 
 def text(names: Sequence[str]) -> np.ndarray:
     """Names as an array of objects, whatever characters they have."""
-    result = np.empty(len(names), dtype=object)
-    result[:] = names
-    return result
+    texts = np.empty(len(names), dtype=object)
+    texts[:] = names
+    return texts
 
 
 def check_title(dataset: "xr.Dataset", title: str) -> None:

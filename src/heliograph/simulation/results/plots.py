@@ -37,24 +37,24 @@ def plot_record(
     which: Any = ... if record.runs is None else run
     drawn = _axes(axes, len(places), record.time, record.units)
     # Mean and +- sigmas claimed deviations, then the truth.
-    for item, i in zip(drawn, places, strict=True):
+    for panel, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
             estimate, colour = record.estimates[node][name], _colour(number)
             mean = np.asarray(estimate.mean)[which][..., i]
             variance = np.asarray(estimate.covariance)[which][..., i, i]
-            item.plot(record.time, mean, color=colour, label=in_figure(name))
+            panel.plot(record.time, mean, color=colour, label=in_figure(name))
             if estimate.claim != "none":
                 band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
-                item.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+                panel.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
         if record.truth is not None:
-            item.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
-        item.set_ylabel(_with_unit(record.states[i], record.units))
+            panel.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
+        panel.set_ylabel(_with_unit(record.states[i], record.units))
     _legend_outside(drawn[0])
     return drawn
 
 
 def plot_statistics(
-    result: "StatisticsByName",
+    statistics: "StatisticsByName",
     node: str | None,
     filters: Sequence[str] | None,
     states: Sequence[str] | None,
@@ -62,22 +62,22 @@ def plot_statistics(
 ) -> "list[Axes]":
     """Draw RMSE over time, and dashed the root of the mean claimed variance."""
     # What is drawn, on which axes.
-    node, filters = _chosen(result, node, filters)
-    places = _places(states, result.states)
-    time = np.arange(1.0, result[node][filters[0]].nees.shape[1] + 1)
-    drawn = _axes(axes, len(places), time, result.units)
-    for single, i in zip(drawn, places, strict=True):
+    node, filters = _chosen(statistics, node, filters)
+    places = _places(states, statistics.states)
+    time = np.arange(1.0, statistics[node][filters[0]].nees.shape[1] + 1)
+    drawn = _axes(axes, len(places), time, statistics.units)
+    for panel, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
             # Solid: actual; dashed: claimed.
-            item, colour = result[node][name], _colour(number)
-            claimed = item.claimed()[:, i, i]
-            single.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
-            single.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
-        single.set_ylabel(f"RMSE of {_with_unit(result.states[i], result.units)}")
+            score, colour = statistics[node][name], _colour(number)
+            claimed = score.claimed()[:, i, i]
+            panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=in_figure(name))
+            panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+        panel.set_ylabel(f"RMSE of {_with_unit(statistics.states[i], statistics.units)}")
         # A log axis where one is far larger than another.
-        ends = [float(np.sqrt(result[node][name].actual()[-1, i, i])) for name in filters]
+        ends = [float(np.sqrt(statistics[node][name].actual()[-1, i, i])) for name in filters]
         if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
-            single.set_yscale("log")
+            panel.set_yscale("log")
     _legend_outside(drawn[0], "dashed: claimed")
     return drawn
 
@@ -117,10 +117,10 @@ def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) 
         )
         grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else _with_unit("time", units))
         return list(grid[:, 0])
-    result = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(result) != count:
-        raise fail("axes", f"{count}, one for each state", len(result))
-    return result
+    given = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(given) != count:
+        raise fail("axes", f"{count}, one for each state", len(given))
+    return given
 
 
 def _legend_outside(axes: "Axes", title: str | None = None) -> None:

@@ -130,8 +130,8 @@ class Record(Saved):
         self.check_filter(node, name)
         if self.truth is None:
             raise fail("errors", "a record with the true state", "a recording without it")
-        result: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
-        return result
+        errors: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
+        return errors
 
     def check_filter(self, node: str, name: str) -> None:
         """Raise ValueError unless the node has a filter of this name."""
@@ -210,11 +210,11 @@ class Record(Saved):
             "claim": (["node", "filter"], claims_of(sizes, results)),
             "mean": (
                 [*axes, TIME, "node", "filter", "state"],
-                filled(lead, sizes, (n,), [(place, np.asarray(e.mean)) for place, e in results]),
+                filled(lead, sizes, (n,), [(position, np.asarray(e.mean)) for position, e in results]),
             ),
             "covariance": (
                 [*axes, TIME, "node", "filter", "state", "other"],
-                filled(lead, sizes, (n, n), [(place, np.asarray(e.covariance)) for place, e in results]),
+                filled(lead, sizes, (n, n), [(position, np.asarray(e.covariance)) for position, e in results]),
             ),
             **uplink_variables(self.uplinks, [*axes, TIME], n),
         }

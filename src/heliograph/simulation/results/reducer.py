@@ -70,7 +70,7 @@ class AbstractReducer(Module, Generic[Result]):
         """Join the results of parts of a network, each of some of its nodes with the same plant and runs."""
         raise NotImplementedError
 
-    def others(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
+    def others(self, filtered: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
         """Return the result with that of smoothed estimates, whose claims these are, as its `smoothed`.
 
         Raises:
@@ -99,22 +99,22 @@ class Trajectories(AbstractReducer[Record]):
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
         """Join the nodes of all parts, in the network's order."""
-        measurements = {name: z for result in results for name, z in result.measurements.items()}
-        estimates = {name: filters for result in results for name, filters in result.estimates.items()}
+        measurements = {name: z for record in results for name, z in record.measurements.items()}
+        estimates = {name: filters for record in results for name, filters in record.estimates.items()}
         return replace(
             results[0],
             measurements={name: measurements[name] for name in network.names},
             estimates={name: estimates[name] for name in network.names},
         )
 
-    def others(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
+    def others(self, filtered: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
         """Return the record with `smoothed`, whose time is that of the last steps if there are fewer."""
         estimates = {
             node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.estimates.items()
         }
-        time = result.time[-len(smoothed.time) :]
-        return replace(result, smoothed=replace(smoothed, time=time, estimates=estimates))
+        time = filtered.time[-len(smoothed.time) :]
+        return replace(filtered, smoothed=replace(smoothed, time=time, estimates=estimates))
 
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:

@@ -35,9 +35,9 @@ class Saved:
             ValueError: a name that is no state.
         """
         smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
-        result = copy(self)
-        vars(result).update(units=checked_units(units, self.states), smoothed=smoothed)
-        return result
+        changed = copy(self)
+        vars(changed).update(units=checked_units(units, self.states), smoothed=smoothed)
+        return changed
 
     def to_xarray(self) -> "xr.Dataset":
         """Convert to labelled arrays.
@@ -126,8 +126,8 @@ def opened(path: str | Path) -> "xr.Dataset":
     if not path.exists():
         raise fail(str(path), "a file of results", "nothing of that name")
     try:
-        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as result:
-            dataset = result.load()
+        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as stored:
+            dataset = stored.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
     return dataset.assign_coords({name: (c.dims, _mapped(from_file, c), c.attrs) for name, c in _texts(dataset)})
@@ -150,6 +150,6 @@ def _mapped(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
     changed = [change(str(name)) for name in names.values]
     if change is in_file:
         return np.array(changed, dtype="U")
-    result = np.empty(len(changed), dtype=object)
-    result[:] = changed
-    return result
+    texts = np.empty(len(changed), dtype=object)
+    texts[:] = changed
+    return texts

@@ -65,8 +65,8 @@ class ErrorStatistics:
     @property
     def covariance(self) -> np.ndarray:
         """Sums of claimed covariances, (batch, time, n, n)."""
-        result: np.ndarray = matrices(self.claimed_pairs) * self.count[:, None, None, None]
-        return result
+        sums: np.ndarray = matrices(self.claimed_pairs) * self.count[:, None, None, None]
+        return sums
 
     @property
     def runs(self) -> int:
@@ -75,13 +75,13 @@ class ErrorStatistics:
 
     def actual(self) -> np.ndarray:
         """E[e e'] over the runs, (time, n, n)."""
-        result: np.ndarray = self.outer.sum(axis=0) / self.runs
-        return result
+        moments: np.ndarray = self.outer.sum(axis=0) / self.runs
+        return moments
 
     def claimed(self) -> np.ndarray:
         """Mean claimed covariance, (time, n, n)."""
-        result: np.ndarray = self.covariance.sum(axis=0) / self.runs
-        return result
+        covariance: np.ndarray = self.covariance.sum(axis=0) / self.runs
+        return covariance
 
     def mean_trace(self) -> float:
         """Mean over time of the trace of the claimed covariance."""
@@ -113,8 +113,8 @@ class ErrorStatistics:
     def rmse_over_time(self) -> np.ndarray:
         """Root mean squared error at each step, (time,)."""
         self._tell()
-        result: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
-        return result
+        rmse: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
+        return rmse
 
     def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
         """Mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
@@ -170,9 +170,9 @@ class ErrorStatistics:
 def matrices(pairs: np.ndarray) -> np.ndarray:
     """Symmetric matrices (..., n, n) from their entries i <= j, row by row."""
     n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
-    place = np.zeros((n, n), dtype=int)
-    place[np.triu_indices(n)] = np.arange(pairs.shape[-1])
-    return np.asarray(pairs[..., np.maximum(place, place.T)])
+    index = np.zeros((n, n), dtype=int)
+    index[np.triu_indices(n)] = np.arange(pairs.shape[-1])
+    return np.asarray(pairs[..., np.maximum(index, index.T)])
 
 
 def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
@@ -181,23 +181,26 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     Runs stay the unit of independence, so errors that nodes share are counted as shared. `statistics` are those of the
     nodes, of the same runs.
 
+    Args:
+        statistics: those of the nodes, of the same runs.
+
     Raises:
         ValueError: nothing to pool, or statistics of different runs.
     """
-    parts = items("pooled statistics", statistics, "ErrorStatistics")
-    for part in parts:
-        instance("pooled statistics", part, ErrorStatistics, "ErrorStatistics")
+    nodes = items("pooled statistics", statistics, "ErrorStatistics")
+    for of_node in nodes:
+        instance("pooled statistics", of_node, ErrorStatistics, "ErrorStatistics")
     # Steps one after another; the weakest claim.
-    if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
-        raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
+    if not nodes or any(not np.array_equal(s.count, nodes[0].count) for s in nodes):
+        raise fail("pooled statistics", "statistics of the same runs", f"{len(nodes)} that differ")
     return ErrorStatistics(
-        parts[0].count,
-        np.concatenate([s.pairs for s in parts], axis=1),
-        np.concatenate([s.claimed_pairs for s in parts], axis=1),
-        np.concatenate([s.nees for s in parts], axis=1),
-        weakest([s.claim for s in parts]),
-        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in parts]),
-        failed_runs=max(s.failed_runs for s in parts),
+        nodes[0].count,
+        np.concatenate([s.pairs for s in nodes], axis=1),
+        np.concatenate([s.claimed_pairs for s in nodes], axis=1),
+        np.concatenate([s.nees for s in nodes], axis=1),
+        weakest([s.claim for s in nodes]),
+        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]),
+        failed_runs=max(s.failed_runs for s in nodes),
     )
 
 
@@ -248,8 +251,8 @@ def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.nda
 
     Each component is in units of its B_ii, and where that is zero of its A_ii.
     """
-    local = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
-    unit = np.where(local[0] > 0, local[0], np.where(local[1] > 0, local[1], 1.0))
+    deviations = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
+    unit = np.where(deviations[0] > 0, deviations[0], np.where(deviations[1] > 0, deviations[1], 1.0))
     both = unit[..., :, None] * unit[..., None, :]
     values, vectors = np.linalg.eigh(b / both)
     root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]

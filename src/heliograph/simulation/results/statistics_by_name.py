@@ -44,18 +44,18 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
     separately.
 
     Args:
-        result: statistics by node and filter.
+        by_node: statistics by node and filter.
         states: names of the plant's states.
         units: by the state's name; by default those that the names have.
     """
 
     def __init__(
         self,
-        result: Mapping[str, dict[str, ErrorStatistics]],
+        by_node: Mapping[str, dict[str, ErrorStatistics]],
         states: tuple[str, ...],
         units: Mapping[str, str] | None = None,
     ):
-        super().__init__(result)
+        super().__init__(by_node)
         self.states, self.units = states, units_in(states) | dict(units or {})
         self.smoothed: StatisticsByName | None = None
 
@@ -67,11 +67,11 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         """
         # Statistics with their places.
         nodes = list(self)
-        filters = list(dict.fromkeys(name for item in self.values() for name in item))
+        filters = list(dict.fromkeys(name for by_name in self.values() for name in by_name))
         every = [
             ((nodes.index(node), filters.index(name)), single)
-            for node, item in self.items()
-            for name, single in item.items()
+            for node, by_name in self.items()
+            for name, single in by_name.items()
         ]
         if not every:
             raise fail("statistics", "those of one filter at least", "none")
@@ -80,17 +80,17 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
         def of(name: str) -> np.ndarray:
             """Return sums of pairs i <= j as symmetric matrices."""
-            return filled(batch, sizes, (n, n), [(place, matrices(getattr(item, name))) for place, item in every])
+            return filled(batch, sizes, (n, n), [(at, matrices(getattr(s, name))) for at, s in every])
 
         # Figures over time: squared errors, claimed variances, NEES, failures.
-        squares = [(place, np.diagonal(item.actual(), axis1=-2, axis2=-1)) for place, item in every]
-        claimed = [(place, np.diagonal(item.claimed(), axis1=-2, axis2=-1)) for place, item in every]
-        sums = [(place, item.nees) for place, item in every]
-        distances = [(place, item.nees.sum(axis=0) / item.runs / n) for place, item in every]
-        by_step = [(place, np.full(steps, np.nan) if item.failed is None else item.failed) for place, item in every]
-        failed = [(place, np.array(item.failed_runs)) for place, item in every]
+        squares = [(position, np.diagonal(score.actual(), axis1=-2, axis2=-1)) for position, score in every]
+        claimed = [(at, np.diagonal(s.claimed(), axis1=-2, axis2=-1)) for at, s in every]
+        sums = [(at, s.nees) for at, s in every]
+        distances = [(at, s.nees.sum(axis=0) / s.runs / n) for at, s in every]
+        by_step = [(at, np.full(steps, np.nan) if s.failed is None else s.failed) for at, s in every]
+        failed = [(at, np.array(s.failed_runs)) for at, s in every]
         filters_of = ["node", "filter"]
-        uplinks = {name: item.uplink for name, item in self.get(FUSED, {}).items() if item.uplink}
+        uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
         # Sums by batch, from which the statistics can be restored, then figures.
         variables = {
             "runs": (["batch"], first.count),
@@ -202,16 +202,16 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return lines
 
 
-def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+def _summary(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
     # Figures of all states together, then of each state.
-    nees, low, high = item.nees_per_dimension()
-    rmse, error = item.rmse()
+    nees, low, high = score.nees_per_dimension()
+    rmse, error = score.rmse()
     # Figures of each state, after those of all together.
-    by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
+    by_state = zip(states, *score.rmse_by_state(), score.deviation_by_state(), strict=True)
     total = {
-        "claim": "none" if item.failed_runs else item.claim,
-        "runs": item.runs,
-        "failed runs": item.failed_runs,
+        "claim": "none" if score.failed_runs else score.claim,
+        "runs": score.runs,
+        "failed runs": score.failed_runs,
         "rmse": rmse,
         "rmse error": error,
         "nees": nees,

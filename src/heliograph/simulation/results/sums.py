@@ -31,7 +31,7 @@ class Sums(NamedTuple):
     failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
 
-    `order`: whose estimates the parts are, kinds first and then fused ones; the first `local` have covariances that
+    `order`: whose estimates the parts are, kinds first and then fused ones; the first `by_run` have covariances that
     differ between runs.
     """
 
@@ -44,7 +44,7 @@ class Sums(NamedTuple):
     failed_runs: np.ndarray
     uplinks: PyTree
     order: tuple[int, ...]
-    local: int
+    by_run: int
 
 
 class Statistics(AbstractReducer[StatisticsByName]):
@@ -56,8 +56,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
         n = len(truth)
         # The axis of parts last.
-        means = [jnp.asarray(part.mean).reshape(-1, n).T for part in parts]
-        claimed = [jnp.moveaxis(jnp.asarray(part.covariance).reshape(-1, n, n), 0, -1) for part in parts]
+        means = [jnp.asarray(estimate.mean).reshape(-1, n).T for estimate in parts]
+        claimed = [jnp.moveaxis(jnp.asarray(estimate.covariance).reshape(-1, n, n), 0, -1) for estimate in parts]
         # Errors and their NEES, and where these are invalid.
         errors = [truth[:, None] - mean for mean in means]
         nees = [squared_distance(b, e, truth[:, None]) for b, e in zip(claimed, errors, strict=True)]
@@ -81,7 +81,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         """Return the carry after all runs, with the covariances that all runs share last."""
         # Values that all runs share count once per run.
         shared = common.sums["claimed"]
-        result, ever = jax.tree.map(
+        totals, ever = jax.tree.map(
             lambda leaf, same: leaf[..., None] * count if same else leaf,
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
@@ -89,27 +89,27 @@ class Statistics(AbstractReducer[StatisticsByName]):
         # Order of the parts: covariances by run first.
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(shared)), key=shared.__getitem__))
-        sizes = [part.shape[1] for part in claimed]
+        sizes = [values.shape[1] for values in claimed]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         into = np.concatenate([places[i] for i in order])
         # Claimed covariances of both kinds.
-        steps, _, pairs, _ = result["pairs"].shape
-        items: Any = count
+        steps, _, pairs, _ = totals["pairs"].shape
+        by_batch: Any = count
         mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
         others: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
-        local: Any = np.concatenate(mine, axis=1)
+        varying: Any = np.concatenate(mine, axis=1)
         common_to_all: Any = np.concatenate(others, axis=1)
         return Sums(
-            runs=items,
-            pairs=result["pairs"][:, into],
-            nees=result["nees"][:, into],
-            claimed=local,
+            runs=by_batch,
+            pairs=totals["pairs"][:, into],
+            nees=totals["nees"][:, into],
+            claimed=varying,
             shared=common_to_all,
-            failed=np.sum(result["failed"], axis=-1)[:, :, into],
+            failed=np.sum(totals["failed"], axis=-1)[:, :, into],
             failed_runs=np.sum(ever, axis=-1)[:, None, into],
-            uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), result["uplinks"]),
+            uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), totals["uplinks"]),
             order=order,
-            local=shared.count(False),
+            by_run=shared.count(False),
         )
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
@@ -122,32 +122,32 @@ class Statistics(AbstractReducer[StatisticsByName]):
         axes = enumerate((-3, -2, -3, -2, -2))
         items = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
         # Statistics with their claims, then those of the quantizers.
-        result = StatisticsByName({}, network.states)
+        statistics = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
-            result[node] = {
-                name: _statistics(count, [part[node][name] for part in items], claim) for name, claim in claims.items()
+            statistics[node] = {
+                name: _statistics(count, [v[node][name] for v in items], claim) for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
-            fused = result[FUSED][name]
+            fused = statistics[FUSED][name]
             means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
-            result[FUSED][name] = replace(fused, uplink=means)
-        return result
+            statistics[FUSED][name] = replace(fused, uplink=means)
+        return statistics
 
     def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
         """Join the nodes of all parts, in the network's order."""
-        collected = {name: filters for result in results for name, filters in result.items()}
+        collected = {name: filters for statistics in results for name, filters in statistics.items()}
         return StatisticsByName({name: collected[name] for name in network.names}, network.states)
 
     def others(
-        self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
+        self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
         """Return the statistics with `smoothed`."""
         results = {
             node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.items()
         }
-        result.smoothed = StatisticsByName(results, smoothed.states)
-        return result
+        filtered.smoothed = StatisticsByName(results, smoothed.states)
+        return filtered
 
 
 def _statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
@@ -164,28 +164,28 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
     """
     # The axis of batches first.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
-    count, pairs, nees, local = (
-        np.moveaxis(np.asarray(part), -1, 0) for part in sums
+    count, pairs, nees, varying = (
+        np.moveaxis(np.asarray(values), -1, 0) for values in sums
     )  # views: they are last in memory
     # Mean claimed covariances.
-    local = local / np.maximum(count, 1.0).reshape(-1, *[1] * (local.ndim - 1))
+    varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
-    result, place = {}, 0
+    split, start = {}, 0
     # Rows of each part, in the order of the sums.
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
-        rows = slice(place, place + int(np.prod(axes)))
-        offset = local.shape[2] if position >= carry.local else 0
-        claimed = (shared if offset or position >= carry.local else local)[
+        rows = slice(start, start + int(np.prod(axes)))
+        offset = varying.shape[2] if position >= carry.by_run else 0
+        claimed = (shared if offset or position >= carry.by_run else varying)[
             :, :, rows.start - offset : rows.stop - offset
         ]
-        result[i] = tuple(
+        split[i] = tuple(
             a.reshape(*a.shape[:2], *axes, *a.shape[3:])
             for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
         )
-        place = rows.stop
-    return count, [result[i] for i in range(len(result))]
+        start = rows.stop
+    return count, [split[i] for i in range(len(split))]
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
@@ -208,9 +208,9 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
         raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]
     # The sums of a simulation, in which this is the only estimate; runs are dealt to batches.
-    arrays = (np.asarray(part, dtype=float) for part in (record.truth, estimate.mean, estimate.covariance))
-    result: OfStep = over_runs(_of_run, *arrays)
-    sums, ever = jax.tree.map(_by_batch, (result.sums, result.ever))
+    arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
+    step: OfStep = over_runs(_of_run, *arrays)
+    sums, ever = jax.tree.map(_by_batch, (step.sums, step.ever))
     count = np.bincount(np.arange(len(record.truth)) % BATCHES, minlength=BATCHES).astype(float)
     common = jax.tree.map(lambda leaf: False, OfStep(sums, ever))
     count, (parts,) = _split(Statistics().summed(OfStep(sums, ever), common, count), [])

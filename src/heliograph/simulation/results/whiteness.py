@@ -124,10 +124,9 @@ def whitened_innovations(
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    item = filter
-    if item.claim == "none":
+    if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    return np.asarray(innovations_of(item, *data_of(item, data, inputs))[1])
+    return np.asarray(innovations_of(filter, *data_of(filter, data, inputs))[1])
 
 
 def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:

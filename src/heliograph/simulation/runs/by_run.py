@@ -22,30 +22,30 @@ def trajectories(
     """
     start, varies, tree = _start(init, keys)
     example = jax.tree.map(lambda leaf: leaf[0], rows)
-    item = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
+    example_carry = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
     # One run's step, without operations that no result needs.
     traced, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
-    )(item, keys[0], example)
+    )(example_carry, keys[0], example)
     body = _needed(traced)
     known = [False] * len(jax.tree.leaves(example))
     # Parts of the carry that depend on the key, as a fixed point; then those of the outputs.
-    spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(item)], varies)
-    differ = _dependent(body, [*spread, True, *known])[len(item) :]
+    spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(example_carry)], varies)
+    differ = _dependent(body, [*spread, True, *known])[len(example_carry) :]
     row_axes: list[int | None] = [None] * len(known)
     # The step for all runs: an axis of runs only where values differ.
     advance = jax.vmap(jaxpr_as_fun(body), in_axes=[*_axes(spread), 0, *row_axes], out_axes=_axes([*spread, *differ]))
 
     def scanned(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
         results = advance(*carry, keys, *jax.tree.leaves(row))
-        return results[: len(item)], results[len(item) :]
+        return results[: len(example_carry)], results[len(example_carry) :]
 
     begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
              for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
     outcome = jax.lax.scan(scanned, begin, rows)[1]
     # The axis of runs first again.
-    result = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(outcome, differ, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(shape[1]), result)
+    outputs = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(outcome, differ, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(shape[1]), outputs)
 
 
 def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
@@ -56,9 +56,9 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    item = [leaf[0] for leaf in leaves]
+    some = [leaf[0] for leaf in leaves]
     # Which results depend on values of single runs.
-    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*item)
+    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*some)
     expected = range(len(traced.jaxpr.outvars))
     tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in expected])[1]) for i in expected]
     # The axis of runs last inside, first outside.

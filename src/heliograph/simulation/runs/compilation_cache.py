@@ -18,22 +18,25 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
     changed. Stored programs are executed: the folder is made for its user alone, and closed to others where it was
     open.
 
+    Args:
+        folder: for the programs (default: heliograph/compilations in the user's cache folder).
+
     Raises:
         ValueError: a folder that cannot be made, or that belongs to another user; no folder, and no home.
     """
     if os.environ.get(FOLDER):
         return Path(os.environ[FOLDER])
-    place = _default() if folder is None else Path(folder)
-    _make_private(place)
+    path = _default() if folder is None else Path(folder)
+    _make_private(path)
     # Settings for JAX, read from the environment or changed where it is loaded already.
-    os.environ[FOLDER] = str(place)
+    os.environ[FOLDER] = str(path)
     shortest = float(os.environ.setdefault(SHORTEST, str(SECONDS)))
     if "jax" in sys.modules:  # it has read the environment already
         import jax
 
-        jax.config.update(FOLDER.lower(), str(place))  # type: ignore[no-untyped-call]
+        jax.config.update(FOLDER.lower(), str(path))  # type: ignore[no-untyped-call]
         jax.config.update(SHORTEST.lower(), shortest)  # type: ignore[no-untyped-call]
-    return place
+    return path
 
 
 def _default() -> Path:
@@ -45,18 +48,18 @@ def _default() -> Path:
         raise _fail("folder for compiled programs", "one, or a home folder to make it in", "neither") from None
 
 
-def _make_private(place: Path) -> None:
+def _make_private(path: Path) -> None:
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.mkdir(mode=PRIVATE, exist_ok=True)
-        there = place.stat()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.mkdir(mode=PRIVATE, exist_ok=True)
+        there = path.stat()
         if hasattr(os, "getuid") and there.st_uid == os.getuid() and there.st_mode & OTHERS_WRITE:
-            place.chmod(PRIVATE)  # as an earlier release made it
-            there = place.stat()
+            path.chmod(PRIVATE)  # as an earlier release made it
+            there = path.stat()
     except OSError as error:
-        raise _fail(f"folder {place}", "one that can be made", error.strerror) from None
+        raise _fail(f"folder {path}", "one that can be made", error.strerror) from None
     if hasattr(os, "getuid") and there.st_uid not in (os.getuid(), 0):
-        raise _fail(f"folder {place}", "the user's own", f"that of user {there.st_uid}")
+        raise _fail(f"folder {path}", "the user's own", f"that of user {there.st_uid}")
 
 
 def _fail(name: str, expected: str, got: object) -> ValueError:

@@ -93,9 +93,9 @@ class Shared(NamedTuple):
     value: PyTree
 
 
-def is_shared(part: PyTree) -> bool:
+def is_shared(leaf: PyTree) -> bool:
     """Test whether a part of the sums is common to all runs."""
-    return isinstance(part, Shared)
+    return isinstance(leaf, Shared)
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -130,6 +130,6 @@ def batch_counts(first_run: int, stop: int) -> np.ndarray:
 
 def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
-    result = np.empty_like(recorded)
-    result[used] = recorded
-    return result.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero
+    ordered = np.empty_like(recorded)
+    ordered[used] = recorded
+    return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

@@ -61,7 +61,7 @@ def native(
             raise
         raise Unsupported("a network with an object that cannot be compared with another") from None
     if isinstance(made, Unsupported):
-        raise Unsupported(made.operation, made.place)
+        raise Unsupported(made.operation, made.where)
     program, form = made
     words = np.asarray(jax.random.key_data(key))
     return Native(program.begin([words, *(a for a in arrays if _is_given(a))]), form)
@@ -127,9 +127,9 @@ def _program(
         whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]
         world, later, inputs, reducer = jax.tree.unflatten(tree, whole)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
-        result = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
-        summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (result.sums, result.ever))
-        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], result.collected))
+        reduced = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
+        summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
+        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], reduced.collected))
         form[:] = [structure, len(jax.tree.leaves(summed))]
         return results
 
@@ -151,8 +151,8 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
     """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
-        state, result = world.step(state, key, row)
-        return state, reducer.of_step(result)
+        state, outputs = world.step(state, key, row)
+        return state, reducer.of_step(outputs)
 
     _, recorded = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return recorded._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), recorded.ever))
@@ -166,8 +166,8 @@ def _smoothed(
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         return world.step(state, key, row)
 
-    _, result = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    return reduced_run(reducer, later, result)
+    _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
+    return reduced_run(reducer, later, outputs)
 
 
 def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
@@ -180,20 +180,20 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
     inputs = [words]
     values: list[Any] = [keys_of(InMemory.whole(words).nodes(graph))]
     # Known arrays are constants; of arguments only zeros and ones are.
-    for item in known:
-        fixed, numbers = item.numbers()
+    for leaf in known:
+        fixed, numbers = leaf.numbers()
         if not _is_given(numbers):
             values.append(lowering.known(numbers))
             continue
         type: Type = "f64" if numbers.dtype.kind == "f" else "u32"
-        buffer = Buffer("input", type, item.shape, graph.top)
+        buffer = Buffer("input", type, leaf.shape, graph.top)
         inputs.append(buffer)
         if numbers.size > LONG:
             values.append(InMemory.whole(buffer))
         else:
             entries = zip(fixed.ravel().tolist(), numbers.ravel().tolist(), range(numbers.size), strict=True)
             values.append(
-                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], item.shape)
+                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], leaf.shape)
             )
     # The program of one run.
     values.append(InMemory.whole(number))

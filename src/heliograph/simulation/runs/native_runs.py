@@ -35,21 +35,21 @@ def natively(
     runs: int,
     chunk: int,
     progress: Progress | None,
-    part: Part | None = None,
+    smoothing: Part | None = None,
 ) -> Result | None:
-    """Simulate a network by native code and reduce its runs; `part` of it is smoothed.
+    """Simulate a network by native code and reduce its runs; a part of it is smoothed.
 
     Returns None where native code does not support the network or the reducer. Draws depend on names alone, and so do
     nodes that share nothing but the plant: they are simulated a few at a time.
     """
     # Smoothing, few nodes, or nodes that share something: one program.
-    whole = part is not None or len(network.names) <= NODES or not _is_apart(network)
+    whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = attempted(lambda: _code(network, inputs, key, reducer, part))
+        code = attempted(lambda: _code(network, inputs, key, reducer, smoothing))
         return (
             None
             if code is None
-            else finished(reducer, _recorded(code, first_run, runs, chunk, progress), network, part)
+            else finished(reducer, _recorded(code, first_run, runs, chunk, progress), network, smoothing)
         )
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
@@ -68,8 +68,8 @@ def natively(
 
 def _is_apart(network: Network) -> bool:
     """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
-    local = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    return len(local) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in local)
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
+    return len(nodes) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in nodes)
 
 
 def _parts(network: Network) -> Iterator[Network]:
@@ -80,12 +80,11 @@ def _parts(network: Network) -> Iterator[Network]:
 
 
 def _code(
-    network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], part: Part | None = None
+    network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], smoothing: Part | None = None
 ) -> Native:
-    filters = AllFilters(network, part and part.kinds)
-    return native(
-        World(network.plant, medium_of(network), filters), inputs, key, reducer, part and part.smoother(filters)
-    )
+    filters = AllFilters(network, smoothing and smoothing.kinds)
+    world = World(network.plant, medium_of(network), filters)
+    return native(world, inputs, key, reducer, smoothing and smoothing.smoother(filters))
 
 
 def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:
@@ -112,9 +111,9 @@ class NativeLanes:
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
             return self.code.begun.add(dealt[lane], sums)
 
-        result = list(threads().map(go, used))
+        collected = list(threads().map(go, used))
         order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        return [None if item[0] is None else np.concatenate(item)[order] for item in zip(*result, strict=True)]
+        return [None if blocks[0] is None else np.concatenate(blocks)[order] for blocks in zip(*collected, strict=True)]
 
     def _runs(self, blocks: np.ndarray) -> np.ndarray:
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
@@ -129,9 +128,9 @@ class NativeLanes:
         summed = code.program.summed.outputs
         leaves, common = [], []
         # Results that all runs share stand as of one run.
-        for item, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
+        for fixed, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
             value = next(totals) if is_summed else None
-            leaves.append(item if shared else value)
+            leaves.append(fixed if shared else value)
             common.append(shared)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return Recorded(sums, same, batch_counts(self.first_run, self.stop), None)
@@ -139,9 +138,9 @@ class NativeLanes:
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Collected results of all runs, (run, ...); a view of one where they share it."""
         leaves: list[Any] = []
-        for item, *single in zip(self.code.begun.shared, *parts, strict=True):
-            if item is not None:
-                leaves.append(np.broadcast_to(item, (self.stop - self.first_run, *item.shape)))
+        for fixed, *single in zip(self.code.begun.shared, *parts, strict=True):
+            if fixed is not None:
+                leaves.append(np.broadcast_to(fixed, (self.stop - self.first_run, *fixed.shape)))
             else:
                 leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected

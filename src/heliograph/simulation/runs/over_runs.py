@@ -55,20 +55,20 @@ def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: in
         first, last = core * share * width, min((core + 1) * share * width, runs)
         parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
-            result = to_numpy(_blocks(function, parts))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], result)
+            outputs = to_numpy(_blocks(function, parts))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
 
     # Each core computes its blocks, then copies them to their place.
     with ThreadPoolExecutor(cores) as pool:
-        result = list(pool.map(work, range(-(-runs // (share * width)))))
-        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), result[0])
+        computed = list(pool.map(work, range(-(-runs // (share * width)))))
+        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
-        def place(core: int) -> None:  # copied by all cores too: large results take their time
-            into, part = jax.tree.leaves(whole), jax.tree.leaves(result[core])
-            for target, leaf in zip(into, part, strict=True):
+        def copy_back(core: int) -> None:  # copied by all cores too: large results take their time
+            into, blocks = jax.tree.leaves(whole), jax.tree.leaves(computed[core])
+            for target, leaf in zip(into, blocks, strict=True):
                 target[core * share * width :][: len(leaf)] = leaf
 
-        list(pool.map(place, range(len(result))))
+        list(pool.map(copy_back, range(len(computed))))
     return whole
 
 
@@ -82,10 +82,10 @@ def _numbers(value: PyTree) -> np.ndarray:
     return values
 
 
-def _filled(part: np.ndarray, count: int) -> np.ndarray:
+def _filled(values: np.ndarray, count: int) -> np.ndarray:
     """Pad to `count` runs with copies of the last one."""
-    missing = count - len(part)
-    return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
+    missing = count - len(values)
+    return values if not missing else np.concatenate([values, np.repeat(values[-1:], missing, axis=0)])
 
 
 @fully_optimised

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliograph_studies.demo.recording import PlazaRecording
-
-CALIBRATED = "plaza2"  # the recording on which the constants of `robot` were measured
-WINDOW = 100  # range rows over which odometry drift is measured: 22.6 s and 78 m on average
+from heliograph_studies.demo.robot import WINDOW
 
 
 @dataclass(frozen=True)

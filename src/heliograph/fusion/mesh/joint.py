@@ -1,0 +1,69 @@
+"""Joint covariance J of the errors of all nodes over a step, by dense matrices in a program, by sparse ones outside.
+
+  J+ = M J M' + F Q F' + sum_l K_l R_l K_l',  K_il R_l K_jl' = W_i S_l W_j'
+
+Blocks (node, degree, n, n) of a matrix are those of each node and its neighbours, itself first; N = nodes n.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import bsr_array
+
+from heliograph.fusion.mesh.gains import Gains
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array, Bool, Float, Int
+
+
+def transitions(gains: Gains, matrix: Float[Array, "n n"]) -> Float[Array, "node degree n n"]:
+    """M_ij of all neighbours, and of the node itself M_ii = F_i A - sum_j M_ij: how errors move."""
+    parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
+    others = (gains.front[:, None] @ parts)[:, 1:]
+    alone = gains.innovation @ matrix - others.sum(axis=1)
+    moves: Float[Array, "node degree n n"] = library(gains).concatenate([alone[:, None], others], axis=1)
+    return moves
+
+
+def used(gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]) -> Float[Array, "node degree n n"]:
+    """W_i where the neighbour's measurement arrived."""
+    taken: Float[Array, "node degree n n"] = library(gain, arrived).where(arrived[..., None, None], gain[:, None], 0.0)
+    return taken
+
+
+def spread(
+    blocks: Float[Array, "node degree n n"], senders: Int[Array, "node degree"], present: Bool[Array, "node degree"]
+) -> Any:
+    """Matrix (N, N) with these blocks where they are present, sparse unless it is traced."""
+    nodes, _, n, _ = blocks.shape
+    if is_traced(blocks):
+        there = jnp.where(present[:, :, None, None], blocks, 0.0)
+        empty = jnp.zeros((nodes, nodes, n, n)).at[np.arange(nodes)[:, None], senders]
+        return empty.add(there).swapaxes(1, 2).reshape(nodes * n, nodes * n)
+    ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    return bsr_array((np.asarray(blocks)[present], senders[present], ends), shape=(nodes * n,) * 2, blocksize=(n, n))
+
+
+def congruence(m: Any, joint: Float[Array, "N N"]) -> Float[Array, "N N"]:
+    """M J M' of a symmetric J."""
+    half = (m @ joint).T
+    carried: Float[Array, "N N"] = m @ (half if is_traced(half) else np.ascontiguousarray(half))
+    return carried
+
+
+def joint_after(
+    joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
+) -> Float[Array, "N N"]:
+    """J+ from M, F, Q, and the matrices of W_i S_j and of W_i over the measurements that node i has."""
+    wide, measured = f.reshape(len(joint), -1), ws @ w.T
+    after = congruence(m, joint)
+    after += wide @ noise @ wide.T
+    after += measured if is_traced(measured) else measured.toarray()
+    joined: Float[Array, "N N"] = (after + after.T) / 2
+    return joined
+
+
+def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:
+    """Joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+    blocks: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
+    return blocks

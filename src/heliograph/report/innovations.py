@@ -1,0 +1,169 @@
+"""Section of a run's report on innovations: their tests, their pictures, and what they say of each output."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import matplotlib
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from heliograph.disk.quoting import in_figure, visible
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph.report.health import FilterHealth, Health
+from heliograph.report.page import Choice, Picture, Section, Table, Text
+from heliograph.simulation.network import FUSED
+from heliograph.simulation.results.record import Record
+
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
+FEW = 8  # pictures one below the other; of more, one is chosen from a list
+MOST = 64  # nodes and links that are drawn; tables and summary hold all
+BAND = 2.0  # deviations
+LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
+
+
+def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
+    """Return the filters in each figure of innovations: one of all, or one of each node where there are many."""
+    tested = _fused_first(filter for filter in health.filters if filter.white is not None)
+    if len(tested) <= FEW:
+        return {"innovations": tested} if tested else {}
+    nodes: dict[str, list[FilterHealth]] = {}
+    for judged in tested:
+        nodes.setdefault(judged.node, []).append(judged)
+    return {f"innovations_{i}": filters for i, filters in enumerate(list(nodes.values())[:MOST])}
+
+
+@matplotlib.rc_context(LOOK)
+def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure:
+    """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
+    figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
+    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    names = _components(health)
+    for axes, judged in zip(grid, tested, strict=True):
+        white = np.asarray(judged.white)
+        # A colour for each output; of more outputs than colours, such as a centre's, one for all.
+        alike = white.shape[1] > len(COLOURS)
+        for i, component in enumerate(white.T):
+            name, colour = ("outputs", BLUE) if alike else (names[judged.node][i], COLOURS[i])
+            label = None if alike and i else in_figure(f"{white.shape[1]} {name}" if alike else name)
+            axes.plot(health.record.time, component, ".", markersize=3, color=colour, label=label)
+        for level in (-BAND, BAND):
+            axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
+        axes.set_title(in_figure(f"{judged.node}/{judged.filter}"))
+        axes.set_ylabel("in deviations")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, markerscale=2)
+    time_axis(health.record, grid[-1])
+    return figure
+
+
+def _components(health: Health) -> dict[str, list[str]]:
+    """Return the names of the measurement's components by node; of a central filter those of all nodes."""
+    names: dict[str, list[str]] = {}
+    for link in health.links:
+        names.setdefault(link.node, []).append(link.component)
+    return names | {FUSED: [f"{link.node}: {link.component}" for link in health.links]}
+
+
+def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Section:
+    """Return the tests of each filter's innovations, their pictures, and what they say of each output."""
+    table = _tests_table(health)
+    text = "An innovation is what arrived less what the filter expected. The tests need no true state."
+    # The innovations themselves, if any filter has some.
+    tested = tested_by_figure(health)
+    pictures = {
+        filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
+                                 f"Innovations in claimed standard deviations, one colour an output (of more than "
+                                 f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
+        for name, filters in tested.items()
+    }  # fmt: skip
+    drawn = {filter.node for filters in tested.values() for filter in filters}
+    left = [f"{filter.node}/{filter.filter}" for filter in health.filters
+            if filter.white is not None and filter.node not in drawn]  # fmt: skip
+    # Fusions of estimates, which are in no row.
+    listed = {(filter.node, filter.filter) for filter in health.filters}
+    fusions = [name for name in health.record.estimates.get(FUSED, {}) if (FUSED, name) not in listed]
+    if fusions:
+        text += (
+            f" A fusion of estimates receives nothing itself ({', '.join(map(visible, fusions))}): the filters that it "
+            "fuses are tested here, and itself on the live page of `heliograph serve`."
+        )
+    missing = not_drawn(left, "Their numbers are in the table.")
+    return Section("Innovations", [Text([text]), table, *chosen(pictures), *missing, *_outputs_table(health)])
+
+
+def _tests_table(health: Health) -> Table:
+    """Return size, correlation and p-value of each filter's innovations, a row each, the fused ones first."""
+    # One row for each filter.
+    rows = []
+    for judged in _fused_first(health.filters):
+        numbers = ["–", "–", "–"]
+        if (test := judged.test) is not None:
+            numbers = [
+                f"{test.power:.2f} ± {1.96 * test.power_error:.2f}",
+                f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
+                "< 0.001" if test.p_value < 0.001 else f"{test.p_value:.3f}",
+            ]
+        rows.append([visible(f"{judged.node}/{judged.filter}"), judged.claim, *numbers])
+    # What the columns are, in words.
+    caption = (
+        "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
+        "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
+        "one row apart: 0 where the filter uses all that it receives. Both with 95 % intervals; **p**: probability of "
+        "such a correlation if there were none."
+    )
+    return Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
+
+
+def _fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
+    return sorted(filters, key=lambda judged: judged.node != FUSED)
+
+
+def _outputs_table(health: Health) -> list[Table]:
+    """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
+    rows = []
+    for output in health.outputs:
+        # Numbers of the summary; the bias to the digits that its interval holds.
+        s = output.summary
+        doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
+        half = (s.bias_high - s.bias_low) / 2
+        name = visible(f"{output.node}/{output.filter}: {output.output}")
+        bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
+        rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
+                     "to blame" if output.to_blame else ""])  # fmt: skip
+    caption = (
+        "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
+        "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
+        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its share "
+        "lies above that of the filter's other outputs together, by an interval of the difference."
+    )
+    return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
+
+
+def rounded(value: float, error: float) -> str:
+    """Return a number to two digits of its standard error; to four of its own without one."""
+    if not (np.isfinite(value) and 0 < error < np.inf):
+        return f"{value:.4g}"
+    places = 1 - int(np.floor(np.log10(error)))
+    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
+
+
+def chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:
+    """Return pictures by node one below the other, or as a choice where there are many."""
+    return (
+        [*pictures.values()]
+        if len(pictures) <= FEW
+        else [Choice("Node", list(map(visible, pictures)), list(pictures.values()))]
+    )
+
+
+def not_drawn(names: Sequence[str], where: str) -> list[Text]:
+    """Return what a figure leaves out for lack of room, by name, and where its numbers are."""
+    if not names:
+        return []
+    return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]
+
+
+def time_axis(record: Record, axes: Axes) -> None:
+    """Name the axis of time, with its unit."""
+    units, dated = record.units, record.time.dtype.kind == "M"
+    axes.set_xlabel("time (UTC)" if dated else in_figure(f"time ({units['time']})" if "time" in units else "time"))

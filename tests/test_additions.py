@@ -1,0 +1,215 @@
+"""Each kind of addition, made in a copy of the library: the files that CONTRIBUTING lists are all that it touches."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import heliograph
+
+SOURCE = Path(heliograph.__file__).parent
+PAGE = SOURCE.parents[1] / "CONTRIBUTING.md"
+
+LAW = {
+    "random_affine/law.py": ("", '''
+
+class Weibull(AbstractLaw):
+    """Weibull fading, g = scale (-log u)^(1/shape) with u uniform."""
+
+    scale: Scalar
+    shape: Scalar
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        return self.scale * jax.random.exponential(key, dtype=float) ** (1 / self.shape)
+
+    def moment(self, order: int) -> float | jax.Array:
+        return self.scale**order * gamma(1 + order / self.shape)
+'''),
+    "random_affine/__init__.pyi": ("    Rician as Rician,\n", "    Weibull as Weibull,\n"),
+}  # fmt: skip
+
+FILTER = {
+    "filters/NAME.py": ("", '''"""Filter with a gain that is chosen once and for all."""
+
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractSizedFilter, corrects, predicts, sized
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.float64 import in_float64
+
+
+class FixedGainFilter(AbstractSizedFilter):
+    """Filter xhat = A xhat + K (z - C A xhat), whose covariance is exact for any K."""
+
+    plant: object
+    sensor: object
+    gain: object
+
+    @in_float64
+    def init(self):
+        return Belief(jnp.asarray(self.plant.initial_mean), jnp.asarray(self.plant.initial_covariance))
+
+    @predicts
+    def predict(self, state, u=(), k=0):
+        a = self.plant.transition_matrix(jnp.asarray(u))
+        noise = self.plant.noise_covariance(jnp.asarray(u))
+        return Belief(a @ state.mean + self.plant.shift(jnp.asarray(u)), a @ state.covariance @ a.T + noise)
+
+    @corrects
+    def correct(self, state, z, k=0):
+        z, c, r = jnp.asarray(z), jnp.asarray(self.sensor.matrix), jnp.asarray(self.sensor.noise.covariance)
+        gain, expected = jnp.where(jnp.isnan(z), 0.0, self.gain), c @ state.mean
+        keep = jnp.eye(len(state.mean)) - gain @ c
+        after = keep @ state.covariance @ keep.T + gain @ r @ gain.T
+        mean = state.mean + gain @ jnp.where(jnp.isnan(z), 0.0, z - expected)
+        return Belief(mean, after), gaussian_innovation(z, expected, c @ state.covariance @ c.T + r)
+
+    def estimate(self, state):
+        return Estimate(state.mean, state.covariance, self.claim)
+
+
+def fixed_gain_filter(plant, sensor, gain):
+    """Filter with a gain that is given."""
+    return FixedGainFilter(plant=plant, sensor=sensor, gain=gain, **sized("exact", plant, len(sensor.outputs)))
+'''),
+    "filters/__init__.pyi": ("", "\nfrom .NAME import fixed_gain_filter as fixed_gain_filter\n"),
+}  # fmt: skip
+
+CHANNEL = {
+    "random_affine/NAME.py": ("", '''"""Rotation of two components by an angle uniform over a range."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import known
+from heliograph.random_affine.moments.monomials import Moments
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
+
+
+class Turned(AbstractRandomAffine):
+    """Map z = R(a) y, a uniform on (-widest, widest)."""
+
+    widest: float
+
+    @property
+    def outputs(self):
+        return 2
+
+    @property
+    def inputs(self):
+        return 2
+
+    def sample(self, key):
+        a = jax.random.uniform(key, minval=-1.0, maxval=1.0, dtype=float) * self.widest
+        return jnp.array([[jnp.cos(a), -jnp.sin(a), 0.0], [jnp.sin(a), jnp.cos(a), 0.0], [0.0, 0.0, 1.0]])
+
+    def moments(self, order):
+        turns = [known([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in NODES * self.widest]
+        matrices = np.array([turn.moments(order).matrix for turn in turns])
+        return Moments(np.tensordot(WEIGHTS / 2, matrices, axes=1), 2, 2, order)
+
+    def mean_gain(self):
+        return known(np.sinc(self.widest / np.pi) * np.eye(2))
+'''),
+    "random_affine/__init__.pyi": ("", "\nfrom .NAME import Turned as Turned\n"),
+    "planning/transmitters.py": (
+        "        case ModeOutput():\n            return channel, position\n",
+        "        case _ if type(channel).__name__ == 'Turned':\n            return channel, position\n",
+    ),
+    "simulation/description/links.py": (
+        "        # One case for each way of making a channel.\n",
+        "        case _ if type(channel).__name__ == 'Turned':\n            return 'turned'\n",
+    ),
+}  # fmt: skip
+
+RULE = {
+    "fusion/rules.py": ("", '''
+
+class FirstOnly(AbstractFusion):
+    """The estimate of the first node, whatever the others say."""
+
+    def claim(self, claims):
+        return claims[0]
+
+    def combine(self, means, covariances):
+        return means[0], covariances[0]
+'''),
+    "fusion/__init__.pyi": ("", "\nfrom .rules import FirstOnly as FirstOnly\n"),
+}  # fmt: skip
+
+WORLD = """
+import numpy as np
+import heliograph as hg
+from heliograph.testing import check_filter, check_fusion, check_random_affine
+plant = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1 * np.eye(2), [1.0, 2.0], np.eye(2))
+sensor = hg.LinearSensor(np.eye(2), 0.1 * np.eye(2))
+def simulated(channel, filter):
+    network = hg.Network(plant, {"a": hg.Node(sensor, channel, {"f": filter})})
+    nees, low, high = hg.monte_carlo(network, 8, 400, 0, keep=hg.Statistics())["a"]["f"].nees_per_dimension()
+    assert low < 1 < high, (nees, low, high)  # the claim is exact; the seed is fixed
+    return network
+def behind(channel):
+    check_random_affine(channel, highest=2)
+    network = simulated(channel, hg.linear_filter(plant, sensor, channel))
+    hg.Stream(hg.linear_filter(plant, sensor, channel)).push([0.1, 0.2])
+    return network, hg.power(network, 5).over_time
+"""
+KINDS = {
+    "a law": (LAW, "behind(hg.hop(hg.random_affine.Weibull(1.0, 2.5), 0.05, dimension=2))"),
+    "a filter": (FILTER, "f = hg.filters.fixed_gain_filter(plant, sensor, 0.3 * np.eye(2)); check_filter(f)\n"
+                         "simulated(hg.perfect(2), f)"),
+    "a channel": (CHANNEL, "network, sent = behind(hg.random_affine.Series([hg.random_affine.Turned(0.7), "
+                           "hg.hop(1.0, 0.1, dimension=2)]))\n"
+                           "assert list(sent) == ['a.hop1'] and 'turned' in repr(network)"),
+    "a rule of fusion": (RULE, "check_fusion(hg.fusion.FirstOnly())"),
+}  # fmt: skip
+
+
+def listed() -> dict[str, tuple[list[str], int]]:
+    """Files of the library and the greatest number of them, by addition."""
+    section = PAGE.read_text().split("\n## What an addition touches")[1].split("\n## ")[0]
+    rows = [row.strip("|").split(" | ") for row in section.splitlines() if row.startswith("| a")]
+    return {
+        row[0].strip(): (re.findall(r"`([\w/]+\.pyi?)`", row[1]), int(row[2]))
+        for row in rows
+        if row[2].strip().isdigit()
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_addition_touches_no_more_files_than_listed(kind, tmp_path):
+    files, most = listed()[kind]
+    changes, trial = KINDS[kind]
+    assert sorted(changes) == sorted(files) and len(files) <= most
+    # The addition, in a copy.
+    copy = tmp_path / "heliograph"
+    shutil.copytree(SOURCE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, (anchor, text) in changes.items():
+        path = copy / name.replace("NAME", "newly_made")
+        before = path.read_text() if path.exists() else ""
+        assert before.count(anchor) == 1 or not anchor
+        at = before.index(anchor) + len(anchor) if anchor else len(before)
+        path.write_text(before[:at] + text.replace("NAME", "newly_made") + before[at:])
+    # What was added does what the library promises of it.
+    done = subprocess.run(
+        [sys.executable, "-c", WORLD + trial], env={"PYTHONPATH": str(tmp_path), "JAX_PLATFORMS": "cpu"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_what_an_addition_touches_is_there():
+    rows = listed()
+    assert set(KINDS) <= set(rows)
+    for kind, (files, most) in rows.items():
+        gone = [name for name in files if "NAME" not in name and not (SOURCE / name).exists()]
+        assert not gone and 0 < len(files) <= most, kind
