@@ -105,10 +105,10 @@ def _components(
     least = ((n + 2) * eps * LEFT) ** 2 * summed(reach * reach, 1)
     # Variance of each component: by its noise, where that is more than rounding of the noises of z, and by rounding.
     square, local = turn * turn, times(turn, root(noise))
-    own = summed(local * local, 1)
-    own = jnp.where(own > (LEFT * eps) ** 2 * times_vector(square, diagonal_of(noise)), own, 0.0)
+    fresh = summed(local * local, 1)
+    fresh = jnp.where(fresh > (LEFT * eps) ** 2 * times_vector(square, diagonal_of(noise)), fresh, 0.0)
     variance = jnp.maximum(pivot, times_vector(square, rounded))
-    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, own, least)
+    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, fresh, least)
 
 
 def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
