@@ -76,7 +76,7 @@ def congruence(a: Array, p: jax.Array) -> jax.Array:
 
 
 def above_products(product: jax.Array, a: Array, p: jax.Array) -> jax.Array:
-    """A P A' of a covariance with the rounding of its sums, so that it is one however much of them cancels.
+    """Return A P A' with the rounding of its sums, so that it is a covariance however much of them cancels.
 
     The product is off by some eps |A| |P| |A|', of which n (n + 2) eps sum_j A_ij^2 P_jj on the diagonal takes care.
     What a step leaves of that is the more beside the variance the more states that are tied cancel, and the next steps
@@ -190,7 +190,7 @@ def pivot_scale(pivot: jax.Array, whole: jax.Array, growth: jax.Array | float) -
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array | float) -> jax.Array:
-    """How far below zero a pivot is rounding of a singular matrix, beside its diagonal entry."""
+    """Return the share of its diagonal entry by which a pivot below zero is rounding of a singular matrix."""
     eps = float(np.finfo(like.dtype).eps)
     return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
