@@ -79,7 +79,7 @@ def above_products(product: jax.Array, a: Array, p: jax.Array) -> jax.Array:
     """Return A P A' with the rounding of its sums, so that it is a covariance however much of them cancels.
 
     The product is off by some eps |A| |P| |A|', of which n (n + 2) eps sum_j A_ij^2 P_jj on the diagonal takes care.
-    What a step leaves of that is the more beside the variance the more states that are tied cancel, and the next steps
+    What a step leaves of that is large against the variance where states that are tied cancel, and the next steps
     may multiply it. Where the product is zero, nothing was rounded.
     """
     n, left = a.shape[1], diagonal_of(product)

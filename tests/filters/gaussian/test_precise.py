@@ -327,7 +327,7 @@ def exact_after_dropout(matrix, mean, tenths):
     return [[float(int(i == j) - p * p * inverse[i][j]) for j in range(2)] for i in range(2)]
 
 
-def test_noise_counts_beside_a_precise_output():
+def test_noise_counts_next_to_a_precise_output():
     """A prior twenty decades above: K is judged by (I - K H) P (I - K H)' + K R K' in exact fractions.
 
     What K leaves is what P+ says, to a quarter; all other digits of 1 - K H are gone.

@@ -104,8 +104,8 @@ def _components(
     eps = float(np.finfo(start.dtype).eps)
     least = ((n + 2) * eps * LEFT) ** 2 * summed(reach * reach, 1)
     # Variance of each component: by its noise, where that is more than rounding of the noises of z, and by rounding.
-    square, part = turn * turn, times(turn, root(noise))
-    fresh = summed(part * part, 1)
+    square, spread = turn * turn, times(turn, root(noise))
+    fresh = summed(spread * spread, 1)
     fresh = jnp.where(fresh > (LEFT * eps) ** 2 * times_vector(square, diagonal_of(noise)), fresh, 0.0)
     variance = jnp.maximum(pivot, times_vector(square, rounded))
     return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, fresh, least)
