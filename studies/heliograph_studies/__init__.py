@@ -4,14 +4,6 @@
 What all of them are made of stands here; figures are in `curves`.
 """
 
-from heliograph_studies.markdown import stated
-from heliograph_studies.outcome import Inline, Unlisted
-from heliograph_studies.settings import NO_FILE, File, check_fields
-from heliograph_studies.stages import Stages
-from heliograph_studies.statement import Sampled, Statement, sampled
-from heliograph_studies.study import Study
+from heliograph.numerics.names import lazy_names
 
-__all__ = [
-    "NO_FILE", "File", "Inline", "Sampled", "Stages", "Statement",
-    "Study", "Unlisted", "check_fields", "sampled", "stated",
-]  # fmt: skip
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
