@@ -51,6 +51,7 @@ def recorded(readme, recording):
     return hg.run(readme, {"cart": recording[0]}, inputs=recording[1]).estimates["cart"]
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", ["relay_aware", "mean_gain"])
 @pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-4)])
@@ -92,6 +93,7 @@ FILTERS = {
 }
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", FILTERS)
 def test_other_filters_too(name, tmp_path):
@@ -102,16 +104,20 @@ def test_other_filters_too(name, tmp_path):
     assert max(apart(Device(item, tmp_path).follow(z, u), follow_known(item, z, u))) < 1e-12
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-5)])
 def test_a_relay_s_schedule(precision, most, tmp_path):
     """Its gains and its covariance are tables: complete data, and NaN for the covariance after a gap."""
     item = scheduled()
     device, z = Device(item, tmp_path, precision=precision), np.random.default_rng(0).normal(size=(30, 1))
+    z[1::2] = 0.0  # while the relay sends, it receives nothing
     assert np.isnan(device.mean()).all(), "before its first prediction a schedule estimates nothing"
     assert max(apart(device.follow(z, np.zeros((30, 0))), follow_known(item, z, np.zeros((30, 0))))) < most
     assert device.step([0.0]) == 3, "past its end"
     device = Device(item, tmp_path, name=f"again_{precision}", precision=precision)
+    assert device.step([0.3]) == 0 and device.step([0.3]) == 5, "there was nothing to receive"
+    device = Device(item, tmp_path, name=f"gap_{precision}", precision=precision)
     assert device.step([np.nan]) == 0 and np.isnan(device.covariance()).all() and np.isfinite(device.mean()).all()
 
 

@@ -8,6 +8,7 @@ from tests.export.device import Device, needs_compiler
 
 STEPS = 3000
 ABSURD = [0.0, 5e-324, 1e-310, 1e-45, 1e-38, 1e-20, 1e6, 1e9, 1e16, 1e20, 3e38, 1e155, 1e200, 1e308, np.inf, np.nan]
+HUGE = [x for x in ABSURD if not abs(x) < 1e16]
 LINE = hg.LinearPlant([[1, 0.1], [0, 0.95]], 0.02 * np.eye(2), [1.0, 2.0], np.eye(2), [[0.0], [0.1]])
 FREE = hg.LinearPlant([[1, 0.1], [0, 0.95]], np.zeros((2, 2)), [1.0, 2.0], np.eye(2), [[0.0], [0.1]])
 BOTH = hg.LinearSensor([[1.0, 0.3], [0.0, 1.0]], 0.05 * np.eye(2))
@@ -21,6 +22,7 @@ FILTERS = {
     "cubature": hg.cubature_filter(LINE, BEARING, hg.perfect()),
     "extended": hg.extended_filter(LINE, BEARING, hg.perfect()),
 }
+BENT = ("cubature", "extended")
 
 
 def drawn(random, size, usual):
@@ -34,7 +36,7 @@ def drawn(random, size, usual):
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_no_number_spoils_a_device(name, precision, tmp_path):
-    """A finite value however large is used where the estimate stays finite: a device has no bound of deviations."""
+    """Whatever comes, the estimate is a number, and what is refused changes nothing."""
     device, random = Device(FILTERS[name], tmp_path, precision=precision), np.random.default_rng(7)
     received, refused = FILTERS[name].received, 0
     with np.errstate(over="ignore"):  # an absurd double is an infinite float
@@ -47,3 +49,29 @@ def test_no_number_spoils_a_device(name, precision, tmp_path):
             assert np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance))
             assert np.all(np.diag(covariance) >= 0)
     assert refused > 0.02 * STEPS
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("name", FILTERS)
+def test_after_absurd_measurements_a_device_follows_the_plant(name, precision, tmp_path):
+    """Every tenth number is replaced by one beyond the bound of 1e6 deviations: it is refused, and nothing else."""
+    filter_, random = FILTERS[name], np.random.default_rng(7)
+    device, plant, x = Device(filter_, tmp_path, precision=precision), filter_.plant, np.array([1.3, 1.8])
+    noise, output = (
+        np.sqrt(0.02) * (plant is LINE),
+        BEARING.function if name in BENT else np.asarray(BOTH.matrix).__matmul__,
+    )
+    with np.errstate(over="ignore"):
+        for k in range(STEPS):
+            x = np.asarray(plant.matrix) @ x + noise * random.normal(size=2)
+            gain = random.choice([0.5, 1.0]) if name == "linear" else 1.0
+            right = gain * np.asarray(output(x)) + np.sqrt(0.05) * (plant is LINE) * random.normal(
+                size=filter_.received
+            )
+            z = np.where(random.random(filter_.received) < 0.1 * (50 < k < STEPS - 200), random.choice(HUGE), right)
+            if device.step(z, [0.0]):
+                assert device.step(np.where(z != right, np.nan, z), [0.0]) == 0
+    deviations = np.sqrt(np.diag(device.covariance())) + 1e-6 * np.abs(x) + 1e-30  # rounding in single precision
+    assert np.all(np.abs(device.mean() - x) < 5 * deviations)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
@@ -14,7 +15,8 @@ from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
 from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
 from heliograph.codegen.memory import LARGE, InMemory
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, step_with_judgement
+from heliograph.filters.plausibility import LIMIT
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 
@@ -102,7 +104,10 @@ class Leaf(NamedTuple):
 
 
 class StepProgram(NamedTuple):
-    """A step: its inputs and outputs; `start_mean` and `start_covariance` are those before the first step."""
+    """A step: its inputs and outputs; `start_mean` and `start_covariance` are those before the first step.
+
+    `implausible`: whether the estimate would lose its digits, so that the step must not be used.
+    """
 
     filter: AbstractFilter
     graph: FiniteGraph
@@ -112,13 +117,17 @@ class StepProgram(NamedTuple):
     k: Buffer
     mean: list[Node]
     covariance: list[Node]
+    implausible: Node
     start_mean: np.ndarray
     start_covariance: np.ndarray
     equations: list[Any]
 
 
-def step_program(filter: AbstractFilter) -> StepProgram:
+def step_program(filter: AbstractFilter, rounding: float) -> StepProgram:
     """Lower `step` of a filter to a graph of scalar operations.
+
+    A measurement that differs from what was expected by less than `rounding` of itself is used, however small its
+    deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
 
     An array of the state that is symmetric at the start, and after every step from a symmetric one, is always
     symmetric: then only one of its triangles is read, and the other is only written.
@@ -131,8 +140,13 @@ def step_program(filter: AbstractFilter) -> StepProgram:
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
 
     def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> PyTree:
-        after, estimate = filter.step(jax.tree.unflatten(tree, leaves), z, u, k)
-        return jax.tree.leaves(after), estimate.mean, estimate.covariance
+        after, estimate, judgement, innovation = step_with_judgement(filter, jax.tree.unflatten(tree, leaves), z, u, k)
+        # Each component by itself, which is cheap: larger than expected, and beyond the bound of its own deviations.
+        differs, variances = jnp.abs(innovation.value), jnp.diagonal(jnp.asarray(innovation.covariance))
+        far = differs > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
+        far &= (jnp.abs(z) > jnp.abs(z - innovation.value)) & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+        implausible = jnp.any(far) | (judgement.input > 0)
+        return jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible
 
     # Trace the step, and refuse random numbers: a device has none.
     program, _ = traced(step, leaves, z, u, k)
@@ -142,9 +156,9 @@ def step_program(filter: AbstractFilter) -> StepProgram:
             raise no_c(equation.primitive.name, code_line(equation))
     estimate, names = filter.estimate(state), names_of(state)
     graph, inputs, outputs = _with_symmetry(program, leaves)
-    # Inputs are (state, z, u, k), outputs (state, mean, covariance).
+    # Inputs are (state, z, u, k), outputs (state, mean, covariance, whether it is implausible).
     *buffers, of_z, of_u, of_k = inputs
-    *after, mean, covariance = map(scalars, outputs)
+    *after, mean, covariance, (implausible,) = map(scalars, outputs)
     parts = zip(names, buffers, map(np.asarray, leaves), after, strict=True)
     return StepProgram(
         filter=filter,
@@ -155,6 +169,7 @@ def step_program(filter: AbstractFilter) -> StepProgram:
         k=of_k,
         mean=mean,
         covariance=covariance,
+        implausible=implausible,
         start_mean=np.asarray(estimate.mean),
         start_covariance=np.asarray(estimate.covariance),
         equations=equations,
