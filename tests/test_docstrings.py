@@ -78,6 +78,7 @@ def parameters(node: Function | ast.ClassDef) -> list[str]:
     return [a.arg for a in every if a.arg not in ("self", "cls")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
     wrong = []
@@ -89,6 +90,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_docstrings_of_studies_and_tests_have_no_private_word():
     """But "beside" for a place: "figures, and what the page says beside the numbers"."""
     wrong = {
@@ -116,6 +118,7 @@ def longest_step(node: Function, lines: list[str]) -> int:
     return longest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_a_long_function_has_a_comment_above_its_steps(path):
     """A step is at most STEP statements, so that no comment stands for half a page."""

@@ -44,6 +44,7 @@ def test_three_rooms_with_quantized_links(tmp_path):
     assert hg.simulation.StatisticsByName.open(tmp_path / "house.nc") == result
 
 
+@pytest.mark.slow
 def test_a_skewed_sensor_with_a_bias():
     """A level gauge whose errors are mostly small and sometimes large, always to one side, recorded on the bench; and a
     leak that nobody measures. I want level and leak, with honest bands, and better than the textbook filter."""
@@ -70,6 +71,7 @@ def test_a_skewed_sensor_with_a_bias():
         assert item["rmse"] == pytest.approx(np.hypot(item["claimed of level"], item["claimed of leak"]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_drone_with_range_bearing_stations_over_a_lossy_relay():
     """A drone circles two ground stations that measure its distance and bearing; a relay forwards their packets, adds a
     little noise and loses one in five. Where is the drone, also when the bearing jumps from pi to -pi?"""

@@ -51,6 +51,7 @@ RULES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES, ids=lambda r: type(r).__name__)
 def test_fusion_in_very_different_units(rule):
     p = np.diag([1e6, 1e-9])
@@ -79,6 +80,7 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
     np.testing.assert_allclose(nothing.mean, means[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_silent_component_is_as_if_it_were_not_there(name):
     received = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])
@@ -98,6 +100,7 @@ def test_behind_a_silent_channel_a_filter_predicts(name, channel):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_noise_free_hops_and_a_position_known_exactly(name):
     twice = hg.LinearSensor([[1.0], [1.0]], 0.0)

@@ -72,6 +72,7 @@ def bound(tree: ast.AST) -> set[str]:
     return names
 
 
+@pytest.mark.slow
 def test_a_name_says_what_it_holds():
     """Of the library: "filter", "moments", "row", where "item" and "result" would do for anything."""
     wrong = {

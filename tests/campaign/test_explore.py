@@ -74,6 +74,7 @@ def test_the_page_holds_the_scores(finished, scores, tmp_path, capsys):
     assert path.stat().st_size < 3e6  # Bokeh's 1.4 MB and the fixed pictures; Plotly alone would be 4.8 MB
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_and_every_text_is_escaped(hostile):
     assert HOSTILE not in hostile and "<img src=x" not in hostile
     (table,) = data(hostile)

@@ -37,6 +37,7 @@ def holder(folder):
     return process
 
 
+@pytest.mark.slow
 def test_one_campaign_a_folder_and_a_killed_one_holds_nothing(tmp_path, expected):
     campaign, out = write(tmp_path), tmp_path / "out"
     process = holder(out)

@@ -18,6 +18,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_sweep(folder, capsys):
     command = ["sweep", "campaign.toml", "--out", "results/a", "--workers", "0"]
     assert cli.main(command) == 0
@@ -103,6 +104,7 @@ def test_words_make_no_axis(tmp_path, finished):
     assert labels == ["gain = 0.5, kind = one", "gain = 0.5, kind = two"]
 
 
+@pytest.mark.slow
 def test_the_page_says_what_failed(tmp_path, finished, fits):
     entry = Failure(3, {"gain": 0.7}, 1, (64, 99), (5, 0, 0), "RuntimeError: <bad> luck", "", "heliograph sweep x")
     html = campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()

@@ -25,6 +25,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_estimates_go_back_into_a_bag(folder, capsys):
     """Each row's odometry has the mean and the covariance of the table, at the time of measuring."""
     assert cli.main([*RUN, "--out", "out.csv"]) == 0 and cli.main([*RUN, "--out", "out.mcap"]) == 0

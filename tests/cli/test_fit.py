@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_the_numbers_are_found_with_their_intervals(folder):
     content = json.loads((folder / "out" / "fitted.json").read_text())
     rows = {row["name"]: row for row in content["table"]}
@@ -135,6 +136,7 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
     assert np.isfinite(list(content["values"].values())).all()
 
 
+@pytest.mark.slow
 def test_the_truth_is_learned_from_where_the_table_has_it(folder, tmp_path, capsys):
     command = [
         "fit",

@@ -35,6 +35,7 @@ def test_run_writes_what_the_library_computes(folder, capsys):
             assert row["valid"] == 1
 
 
+@pytest.mark.slow
 def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0
     written = "out.csv and page/report.html: 4 rows of remote/aware (nominal), remote/trusting (nominal)\n"

@@ -52,6 +52,7 @@ def measurements(item, runs, steps):
     return np.where(RANDOM.random(z.shape) < 0.1, np.nan, z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_filter_gives_what_xla_gives(name):
     """Of LLVM's code and of JAX's operation by operation, to 1e-12 of the claimed deviation; missing data among it."""
@@ -193,6 +194,7 @@ def test_special_numbers_are_what_jax_makes_of_them(function):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_random_draws_are_those_of_jax():
     def draw(number):
         key = jax.random.fold_in(jax.random.key(3), number)
@@ -208,6 +210,7 @@ def test_random_draws_are_those_of_jax():
     np.testing.assert_array_equal(by_jax[0], expected[0])
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_graph_are_those_of_the_function():
     item = FILTERS["extended"]()
     single, z = over_recording(item), RANDOM.normal(size=(15, item.received))

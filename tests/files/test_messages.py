@@ -42,6 +42,7 @@ def test_header_and_log_times_are_both_there(world):
     assert arrivals == sorted(arrivals) and "/picture (20)" in table.notes[0]
 
 
+@pytest.mark.slow
 def test_rows_are_what_a_timeline_puts_in_order(world):
     """With a window that nothing misses, the final estimates are those of the rows in the order of measuring."""
     network, sources, _, path = world

@@ -190,6 +190,7 @@ def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     assert item.claim == "nominal"  # a circle is no line: P grows beyond it
 
 
+@pytest.mark.slow
 def test_an_unknown_heading_is_no_smaller_than_known():
     """Points that lie more than half a turn apart still tell how a compass is correlated with the heading."""
     plant, sensor = turning(True)
@@ -200,6 +201,7 @@ def test_an_unknown_heading_is_no_smaller_than_known():
     assert abs(nearest(np.asarray(estimate.mean), np.array([-3.0, 0.0]), (0,))[0] + 3.0) < 0.01
 
 
+@pytest.mark.slow
 def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
     mean = np.array([[3.1, 1.0], [-3.1, 2.0]])
     two = [hg.model.Estimate(m, np.eye(2), "nominal") for m in mean]

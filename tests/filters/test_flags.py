@@ -20,6 +20,7 @@ MIXED = {
 SENT = [[1.0, 0.0], [0.3, 1.0], [np.nan, 1.0], [0.5, np.nan], [-0.4, 0.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MIXED)
 def test_modes_of_any_kinds_are_those_of_the_filter_that_takes_flags(name):
     """Two programs of one recursion: 1e-12 of numbers of order one."""

@@ -11,12 +11,14 @@ from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, v
 STEPS = 200  # after which no variance changes any more
 
 
+@pytest.mark.slow
 def test_fading_in_bursts():
     """P_1, P_2, P_10, P_inf to the digits given."""
     result = variances(PLANT, SENSOR, bursts(), STEPS)[[0, 1, 9, -1], 0]
     np.testing.assert_allclose(result, [0.323796, 0.283304, 0.248939, 0.238689], atol=6e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
 def test_two_sensors_with_shared_fading_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
@@ -24,6 +26,7 @@ def test_two_sensors_with_shared_fading_or_in_two(shared, limit):
     assert variances(PLANT, two, links, STEPS)[-1, 0] == pytest.approx(limit, abs=6e-7)
 
 
+@pytest.mark.slow
 def test_two_drifting_hops():
     plant = hg.LinearPlant([[0.98, 0.1], [0, 0.95]], np.diag([0.002, 0.02]), [1.0, 0.0], np.diag([1.0, 0.2]))
     first, second = (hg.model.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9)))
@@ -70,6 +73,7 @@ def test_estimates_do_not_depend_on_the_order_of_modes_and_hold_in_simulation():
     assert np.all(np.abs(squares.mean(axis=0) - claimed) < 4 * squares.std(axis=0) / np.sqrt(4000))
 
 
+@pytest.mark.slow
 def test_what_does_not_arrive_is_left_out():
     item = hg.linear_filter(PLANT, SENSOR, bursts())
     state = item.predict(item.init())

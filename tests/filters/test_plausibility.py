@@ -40,6 +40,7 @@ FILTERS = {
 ABSURD = [1e16, -1e20, 1e155, -1e308]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_no_absurd_value_leaves_a_trace(name):
     """Measurements, with and without missing components, and inputs; the state after it, bit for bit."""
@@ -113,6 +114,7 @@ def test_a_prediction_over_an_absurd_time_is_no_number():
     assert np.isfinite(stream.push([1.0], [1.0]).mean).all()
 
 
+@pytest.mark.slow
 def test_in_single_precision_too():
     """The bound is eps^-1/2 = 2,900 deviations, where eps d^2 is all of a variance; squares of sentinels overflow."""
     most = 2.0**23

@@ -19,6 +19,7 @@ Z, U = RNG.normal(size=(20, 2)), RNG.normal(size=(20, 1))
 Z[[3, 4, 4, 9], [0, 0, 1, 1]] = np.nan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("item", [hg.kalman_filter(PLANT, SENSOR), hg.linear_filter(PLANT, SENSOR, RELAY)])
 def test_it_is_the_steps_of_the_filter(item):
     by_rows, by_steps = item.run(Z, U), follow(item, Z, U)
@@ -66,6 +67,7 @@ def test_a_matrix_that_does_not_fit_is_named():
         hg.state_space(np.eye(2), [[1.0]], 1.0, 1.0, [0.0, 0.0], 1.0)
 
 
+@pytest.mark.slow
 def test_likelihoods_are_differentiated_through_the_same_scan():
     def value(q):
         plant, sensor = hg.state_space([[0.9]], [[1.0]], q, 1.0, [0.0], 1.0)

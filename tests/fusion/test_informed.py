@@ -27,6 +27,7 @@ def brute_force(plant, parts, steps):
     return stacked_errors(model, nodes, steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     """Against the stacked problem in NumPy to 1e-9, and to the digits that the cases are stated with."""

@@ -22,6 +22,7 @@ def certified(information):
     return weights, relative_gap(information, weights)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), shape=st.sampled_from([(2, 2), (4, 1), (6, 5)]))
 def test_the_gap_of_the_weights_is_certified(seed, shape):
@@ -33,6 +34,7 @@ def test_the_gap_of_the_weights_is_certified(seed, shape):
     assert np.all(weights >= 0) and weights.sum() == pytest.approx(1, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_weights_agree_with_slsqp():
     bounds = np.stack([covariances(seed, 4, 5) for seed in range(20)])
     reference = oracle.trace_weights(bounds)

@@ -44,6 +44,7 @@ def test_weighted_fusion_by_hand():
     assert fused.covariance[0, 0] == 2.5 and fused.claim == "upper"
 
 
+@pytest.mark.slow
 def test_estimates_that_claim_no_covariance():
     """A weighted mean needs none; rules that weigh by covariances say so."""
     some = estimates(covariances(0, 2, 2), "exact")
@@ -57,6 +58,7 @@ def test_estimates_that_claim_no_covariance():
     assert [weakest([a, "none"]) for a in STRENGTH] == ["none"] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rule", [hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
 )
@@ -73,6 +75,7 @@ def test_a_dominating_sensor_is_returned():
     np.testing.assert_allclose(fused.covariance, good, rtol=1e-8)  # weight 1 is approached from inside: gap 1e-10
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=20)
 def test_optimal_is_best_and_no_worse_than_any_input(seed):
@@ -192,6 +195,7 @@ def faded():
     return rules, hg.monte_carlo(result, 8, 2000, 1)
 
 
+@pytest.mark.slow
 def test_fusion_inside_the_scan_is_fusion_outside(faded):
     rules, record = faded
     for name, fusion in rules.items():

@@ -60,6 +60,7 @@ def by_hand(steps):
     return joint
 
 
+@pytest.mark.slow
 def test_cross_covariances_of_what_is_shared():
     cross = hg.simulation.cross_covariances(shared_network({}), "local", 15)
     np.testing.assert_allclose(cross.joint, by_hand(15), rtol=1e-9, atol=1e-12)

@@ -31,6 +31,7 @@ def gain(rule, given):
     return values
 
 
+@pytest.mark.slow
 def test_it_is_above_whatever_the_unknown_parts_have_in_common():
     """Unknown parts that are all one source, turned at random, and independent ones: 200 ways, none above the claim."""
     known, unknown = parts(0)

@@ -58,6 +58,7 @@ def over_the_horizon(i):
     return hg.h_infinity.horizon_design(node(i))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i", range(4))
 def test_smallest_levels_over_the_horizon(i):
     """Two solvers and an independent derivation agree to the digits given; separate multipliers have a closed form."""
@@ -69,6 +70,7 @@ def test_smallest_levels_over_the_horizon(i):
         assert hg.h_infinity.certify_level(node(i), item.gains, item.weights, item.multipliers, item.level).certified
 
 
+@pytest.mark.slow
 def test_the_recursion_cannot_look_ahead():
     result = hg.h_infinity.recursive_design(node(0))
     np.testing.assert_allclose(result.level, 0.02696, rtol=5e-4)
@@ -113,6 +115,7 @@ def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
     np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
 
 
+@pytest.mark.slow
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
     third, short = node(2, steps=2), node(0, steps=2)

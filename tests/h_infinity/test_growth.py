@@ -18,6 +18,7 @@ REFUTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUTED)
 def test_local_evidence_refutes(name):
     function, constant, text = REFUTED[name]
@@ -104,6 +105,7 @@ def growing(constant):
     return system, hg.h_infinity.horizon_design(system)
 
 
+@pytest.mark.slow
 def test_a_certificate_says_what_it_rests_on_and_refuses_what_does_not_fit():
     system, design = growing(0.7)
     parts = design.gains, design.weights, design.multipliers, design.level

@@ -66,6 +66,7 @@ def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
     assert result.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_learned_covers_the_truth(result):
     assert result.converged
     for row in result.rows():

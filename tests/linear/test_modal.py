@@ -76,6 +76,7 @@ def test_a_relay_that_filters_in_the_fading_of_its_receiver():
     np.testing.assert_allclose(hg.linear.lmmse(system).gains.covariance, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_plant_that_changes_with_the_mode():
     """A mode of the plant that is received only through it, and other fading on the link."""
     plants = [
@@ -93,6 +94,7 @@ def test_a_plant_that_changes_with_the_mode():
     hg.testing.check_filter(item, steps=4)
 
 
+@pytest.mark.slow
 def test_without_modes_of_the_plant_it_is_the_linear_filter():
     move = GainAndNoise(Constant(1.0), PLANT.matrix, PLANT.noise)
     observed = Series([GainAndNoise(Constant(1.0), SENSOR.matrix, SENSOR.noise), bursts()])

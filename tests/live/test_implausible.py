@@ -16,6 +16,7 @@ def same(result, expected):
             np.testing.assert_array_equal(result[node][name].covariance, estimate.covariance, f"{node}/{name}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [pytest.param(forgetful, marks=pytest.mark.slow), moving])
 def test_absurd_events_leave_no_trace(make):
     """Of nodes and of inputs, newest and late ones, in a row of their own and in one that others have."""
@@ -41,6 +42,7 @@ def test_absurd_events_leave_no_trace(make):
     same(result.estimates, expected.estimates)
 
 
+@pytest.mark.slow
 def test_one_filter_alone_leaves_out_what_only_it_finds_implausible():
     """It believes noise of 1e-16: 1 is 1e8 of its deviations. The others use it, and it goes on with what it knew."""
     sure = hg.LinearSensor([[1.0]], 1e-16)
@@ -84,6 +86,7 @@ def test_values_beyond_limits_count_as_not_arrived():
     np.testing.assert_allclose(last, record_.estimates["a"]["f"].mean[-1], atol=1e-14)  # two programs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [None, hg.smoothing.FixedInterval()])
 def test_absurd_rows_of_a_recording_leave_no_trace(smooth):
     item, other = hg.linear_filter(PLANT, SENSOR, FADING), hg.cubature_filter(PLANT, SENSOR, FADING)

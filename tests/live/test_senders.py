@@ -80,6 +80,7 @@ def chain(channel):
     return result
 
 
+@pytest.mark.slow
 def test_a_stream_says_which_steps_are_silent_and_whether_its_sender_is_dead():
     stream = hg.Stream(network(hg.perfect()).nodes["a"].filters["f"])
     for value in (0.2, np.nan, 1.0, np.nan, np.nan, np.nan, np.nan):

@@ -64,6 +64,7 @@ def rows(count=30):
     return z, rng.normal(size=(count, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", filters())
 def test_both_engines_have_the_same_numbers(name, monkeypatch):
     item = filters()[name]
@@ -148,6 +149,7 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
             stream.push([np.inf, 1.0], [0.0])
 
 
+@pytest.mark.slow
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
     """One that adds up what data say belongs together; by native code alone it is refused in one line."""
     hop = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 0.1, dimension=2)

@@ -122,6 +122,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name):
     make, parameters = LAWS[name]
@@ -154,6 +155,7 @@ def test_rician_moments_are_those_of_the_hypergeometric_function(order, sight):
     assert hg.random_affine.Rician(sight, 0.3).moment(order) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_noises_and_moments_of_every_map_can_be_traced():
     """Joint moments to order four of a channel made of everything, and its draws, against their concrete numbers."""
 

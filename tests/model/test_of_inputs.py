@@ -53,6 +53,7 @@ FILTERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize(("plant", "pushed"), [(PLANT, False), (PUSHED, True)], ids=["moved", "pushed"])
 def test_a_filter_is_that_of_the_plant_step_by_step(name, plant, pushed):

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from heliograph.numerics.linalg import times
 from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
@@ -54,6 +55,7 @@ def test_results_that_no_run_has_a_part_in_come_for_each():
     np.testing.assert_array_equal(traces, [np.trace(B)] * 4)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_arithmetic_forward_and_back_one_or_many():
     """Of the sum of squares of A B: 2 A' A B in B, 2 A B B' in A."""
     with jax.enable_x64(True):

@@ -47,6 +47,7 @@ def test_one_hop_reaches_the_example(single, total):
     assert cheap.certificate.gap < 1e-9 and cheap.certificate.words.startswith("optimal within")
 
 
+@pytest.mark.slow
 def test_two_hops_reach_the_example_where_one_start_does_not(double):
     result = hg.design(double, budget=6)
     assert result.error == pytest.approx(1.36438855, abs=1e-8)
@@ -129,6 +130,7 @@ def test_one_node_with_parallel_chains_is_the_same(single):
     assert list(result.powers)[1] == "all.part2.hop1"
 
 
+@pytest.mark.slow
 def test_the_designed_network_claims_the_designed_error(single):
     result = hg.design(single, budget=10)
     steady = steady_covariance(result.network.fused["best"])

@@ -42,6 +42,7 @@ CHANNELS = {
 LARGE = {"three hops", "dropout", "direct link", "parallel", "dropout of a direct link in series"}  # cost most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])
 def test_samples_match_moments_to_order_four(name):
     check_random_affine(CHANNELS[name])

@@ -16,6 +16,7 @@ def drawn(law, count=100_000):
         return np.asarray(jax.jit(jax.vmap(law.sample))(jax.random.split(jax.random.key(1), count)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [

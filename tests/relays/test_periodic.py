@@ -31,6 +31,7 @@ def traces(covariance):
     return np.trace(covariance, axis1=1, axis2=2)
 
 
+@pytest.mark.slow
 def test_the_steady_state_is_where_the_recursion_stays(local):
     odd, even = local.trace("receiver")[1:]
     assert (even, odd) == pytest.approx((5.307279e-6, 5.355157e-6), rel=1e-6)  # digits given
@@ -40,6 +41,7 @@ def test_the_steady_state_is_where_the_recursion_stays(local):
     assert relative(given.moments, local.moments) < 1e-9  # of a linear solve: condition about 1e3
 
 
+@pytest.mark.slow
 def test_tuned_together_at_no_more_power(local):
     """The reproduction's tests have the designs without a limit."""
     quiet = periodic_receiver_error_design(example(), power_limit=local.total_power())
@@ -49,6 +51,7 @@ def test_tuned_together_at_no_more_power(local):
     assert relative(given_design(example(), gains).moments[-2:], quiet.moments[1:]) < 1e-6  # what 0.974 a period leaves
 
 
+@pytest.mark.slow
 def test_the_best_receiver_behind_given_relays(local):
     behind = periodic_behind_relays(example(), local.gains)
     assert np.sum(traces(behind)) == pytest.approx(1.05316e-5, rel=1e-5)  # digits given
@@ -56,6 +59,7 @@ def test_the_best_receiver_behind_given_relays(local):
     assert relative(long.gains.covariance[-2:], behind) < 1e-9
 
 
+@pytest.mark.slow
 def test_without_relays_it_is_the_linear_filter():
     full = example()
     direct = full.slots[1]["relay_1"]["sensor"]

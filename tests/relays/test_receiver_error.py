@@ -50,6 +50,7 @@ def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=
         np.testing.assert_allclose(np.mean(ratio(design, separate)), result, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_same_limit_gives_the_same_bits(horizon=40):
     power = local_error_design(example(), horizon).total_power()
     first, second = (receiver_error_design(example(), horizon, power_limit=power, sweeps=20) for _ in range(2))
@@ -65,6 +66,7 @@ def test_a_limit_that_does_not_bind_costs_nothing(greedy, free):
     np.testing.assert_allclose(*costs, rtol=1e-4)  # what the last barrier may leave
 
 
+@pytest.mark.slow
 def test_a_limit_just_above_the_power_of_the_mean_is_met(greedy):
     """Nearly all that three relays, one silent in each slot, may send is the mean, which says nothing."""
     net = unusual()
@@ -105,6 +107,7 @@ def test_limits_that_can_not_be_met_are_refused(local):
         receiver_error_design(example(), HORIZON, weights=-np.ones(HORIZON))
 
 
+@pytest.mark.slow
 def test_one_step_ahead_greedy_is_best_for_the_receiver(greedy):
     """With all weight on the last step, that step's receiver gain is the greedy one for the moments it meets."""
     net, weights = unusual(), np.eye(STEPS)[-1]
@@ -113,6 +116,7 @@ def test_one_step_ahead_greedy_is_best_for_the_receiver(greedy):
     assert recompute(net, tuned.gains).correlation["receiver"][-1] < 1e-6  # the damping of the gains is 1e-9
 
 
+@pytest.mark.slow
 def test_the_gradient_vanishes_in_every_gain(greedy, free):
     """By central differences of a recursion that made no gains, against the slope at the start of the search."""
     net = unusual()

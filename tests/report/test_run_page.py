@@ -36,6 +36,7 @@ def health():
     return examine(NETWORK, hg.run(NETWORK, received), np.zeros((STEPS, 0)))
 
 
+@pytest.mark.slow
 def test_claims_are_judged_by_innovations(health):
     good, sure = (next(filter_ for filter_ in health.filters if filter_.filter == name) for name in ("good", "sure"))
     assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.significant
@@ -74,6 +75,7 @@ def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
     assert summary["filters"]["a"]["good"]["size"] == next(f for f in health.filters if f.filter == "good").test.power
 
 
+@pytest.mark.slow
 def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
     """Neither in the table of tests nor beside its errors, nor in the summary."""
     plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
@@ -102,6 +104,7 @@ network = hg.Network(plant, {"n": node})
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [3, 120])
 def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     monkeypatch.chdir(tmp_path)
@@ -123,6 +126,7 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
     assert cli.main(arguments[:-2]) == 2 and "(--out FILE) or a folder for a report" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_of_many_nodes_one_is_chosen_from_a_list_the_fused_estimate_first(fits):
     """Ten nodes and a centre: every estimate and every filter's innovations are there, one shown at a time."""
     sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["height"])
@@ -159,6 +163,7 @@ network = hg.Network(plant, nodes, {"centre": hg.kalman_filter(plant, both)})
 """
 
 
+@pytest.mark.slow
 def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "net.py").write_text(CENTRAL)
@@ -171,6 +176,7 @@ def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch
     assert "fused: estimates with bands" in page and "fused/centre" in page
 
 
+@pytest.mark.slow
 def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
     """Behind a gain that is random, the filter that takes its mean is too sure; the network relies on the exact one."""
     sensor = hg.LinearSensor([[1.0]], 0.1, outputs={"height": "m"})

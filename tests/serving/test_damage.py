@@ -70,6 +70,7 @@ def without_numbers(estimates):
     return [{key: value for key, value in estimate.items() if key != "id"} for estimate in estimates]
 
 
+@pytest.mark.slow
 def test_no_byte_of_a_body_changes_unseen(whole, tmp_path, mine):
     place = copy(whole, tmp_path)
     ((body,),) = changed(place, "select body from plants where name = 'p1'")

@@ -114,6 +114,7 @@ def agree(result: dict[str, dict[int, dict[str, list]]], lost: np.ndarray, netwo
             np.testing.assert_allclose(item["covariance"], expected.covariance[k], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.4])
 def test_services_that_exchange_messages_tell_what_one_run_tells(loss: float):
     lost = some_lost(loss)

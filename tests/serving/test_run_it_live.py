@@ -58,6 +58,7 @@ def piped(command, capfd):
     return [json.loads(line) for line in source.read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     (command,) = PIPED.findall((ROOT / "README.md").read_text())

@@ -63,6 +63,7 @@ def test_an_output_claims_nothing_where_covariances_are_no_numbers_or_negative()
         assert claims == {k: claim if k < lost else "none" for k in range(len(values))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [True, False])
 def test_verdicts_and_estimates_are_those_of_a_timeline(whole):
     """Within 1e-12: two programs that are compiled apart; the estimates are of order one."""
@@ -166,6 +167,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 def test_robust_and_adaptive_filters_say_what_they_made_of_each_number():
     """Innovations and weights of a service are those of the filters over the same rows; the broken output is to blame.
 

@@ -50,6 +50,7 @@ def test_it_is_that_of_all_that_arrives_by_the_prediction_from_the_fused_estimat
             before[name] = outputs[place.mean : place.mean + 2], outputs[cut].reshape(2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["several modes", "a shared channel"])
 def test_there_is_none_where_a_state_is_more_than_a_mean_and_a_covariance_or_noises_depend_on_each_other(case):
     rule = hg.fusion.EqualIntersection()

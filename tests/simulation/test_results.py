@@ -103,6 +103,7 @@ def test_a_record_comes_back_from_arrays_tables_and_pickles(record):
     assert identical(pickle.loads(pickle.dumps(record)), record) and identical(copy.deepcopy(record), record)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(record=records(), ending=st.sampled_from([".nc", ".nc", ".zarr"]))
 def test_a_record_comes_back_from_a_file(record, ending, tmp_path):
@@ -118,6 +119,7 @@ def test_names_in_files_can_be_read_and_undone(name):
     assert from_file(in_file(name)) == name and in_file(name).isprintable()
 
 
+@pytest.mark.slow
 @settings(max_examples=8, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     names=st.lists(NAMES, min_size=2, max_size=2, unique=True),

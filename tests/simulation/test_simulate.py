@@ -84,6 +84,7 @@ def leaves(record):
     return [record.truth, *record.measurements.values(), *jax.tree.leaves(record.estimates)]
 
 
+@pytest.mark.slow
 def test_shapes_and_order(record):
     assert record.truth.shape == (RUNS, HORIZON, 2)
     assert list(record.measurements) == ["b", "a", "direct", "silence"]
@@ -118,6 +119,7 @@ def test_another_node_and_links_change_nothing_else(record):
         np.testing.assert_allclose(other.estimates[name]["linear"].mean, record.estimates[name]["linear"].mean)
 
 
+@pytest.mark.slow
 def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
     measurements = {name: z[3].copy() for name, z in record.measurements.items()}
     through = hg.run(NETWORK, measurements, INPUTS)
@@ -175,6 +177,7 @@ def sent_step_by_step(fusion, record, run):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["static", "escape", "by component"])
 def test_quantizers_in_the_scan_are_quantizers_in_a_loop(record, name):
     fusion, uplink = FUSED[name], record.uplinks[name]
@@ -227,6 +230,7 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
         np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
     result = statistics["fused"]["over time"]

@@ -23,6 +23,7 @@ def mixed(parts: list[Stacked], chances: np.ndarray) -> Stacked:
     return Stacked(means[0], xx, means[1], xz, zz)
 
 
+@pytest.mark.slow
 def test_behind_a_link_that_remembers_it_is_the_best_linear_estimate():
     a, q, mean, p0 = np.array([[0.9, 0.2], [0.0, 0.7]]), np.diag([0.3, 0.0]), np.array([1.0, -0.5]), np.diag([0.5, 0.2])
     plant, sensor = hg.LinearPlant(a, q, mean, p0), hg.LinearSensor([[1.0, 0.5]], 0.1)

@@ -37,6 +37,7 @@ def problem(seed):
     return item, stacked(mean, covariance, steps), z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_smoothers_are_the_stacked_linear_estimate(seed):
     item, whole, z = problem(seed)
@@ -87,6 +88,7 @@ def test_what_a_precise_future_leaves_keeps_its_digits():
     np.testing.assert_allclose(result[[0, -1], 0, 0], ends, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "smoothing", [hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(3), hg.smoothing.FixedPoint(1)]
 )
@@ -110,6 +112,7 @@ def test_a_state_that_later_data_tell_exactly_is_smoothed_to_its_rounding(smooth
             assert variance[seen, 0].max() < 1e-16  # rounding of P, where the first was unseen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", [hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(3)])
 def test_a_state_without_noise_is_smoothed_to_some_roundings(smoothing):
     """A plant and an output free of noise: from the first data on, the state is known.

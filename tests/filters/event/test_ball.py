@@ -27,6 +27,7 @@ def on_a_grid(centre, variance, radius, inside):
     return mass, mean, np.einsum("iab,jab,ab->ij", apart, apart, weight) / mass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize(
     ("centre", "variance"),

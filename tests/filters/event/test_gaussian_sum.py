@@ -31,6 +31,7 @@ def judged(item, z, exact):
     return np.sqrt(square.mean() / variance.mean()), np.mean(square / result.covariance[:, 0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "link"), [pytest.param(hg.perfect(), forgetful(0.0), marks=pytest.mark.slow), (LOSSY, forgetful(0.2))]
 )
@@ -184,6 +185,7 @@ def test_what_does_not_fit_is_refused_in_one_line():
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["zero", "prediction"])
 @pytest.mark.parametrize("link", [hg.perfect(), hg.hop(0.7, noise=0.05)], ids=["perfect", "hop"])
 def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, reference):

@@ -134,6 +134,7 @@ def test_scaling_signal_gain_and_noise_together_changes_nothing():
     agree(follow(hg.cubature_filter(*ours, machine.channel(traded)), z), first)
 
 
+@pytest.mark.slow
 def test_a_silent_amplifier_leaves_the_inflated_prediction():
     """alpha = 0: K = 0 and Xi = (1 + beta_1) P-."""
     off = {**STRONG, "alpha": 0.0}
@@ -204,6 +205,7 @@ FILTERS = {
 PARALLEL = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.random_affine.Nakagami(2.0), 0.2)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_contract(name):
     check_filter(FILTERS[name](PARALLEL))

@@ -37,6 +37,7 @@ def claimed(item):
     return np.array(results)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wide", "precise"), [(1e4, 1e-9), (1e8, 1e-12), (1e6, 1e-3), (1e2, 1.0)])
 def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     """A difference P - K C P is 1e-16 P wrong: 7e4 times what is left in the second case.
@@ -53,6 +54,7 @@ def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_run_takes_the_form_that_its_numbers_need():
     """Beside a precise one or alone, a run's bits are the same."""
     plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
@@ -68,6 +70,7 @@ def test_a_run_takes_the_form_that_its_numbers_need():
     assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
     """The gradient of a sum over runs is each run's gradient, to rounding."""
     item = hg.linear_filter(hg.LinearPlant(A, 0.01, [0.0, 0.0], 1.0), hg.LinearSensor(C, 0.1), hg.perfect(1))
@@ -125,6 +128,7 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
@@ -192,6 +196,7 @@ def test_an_output_that_says_what_others_said_is_left_out():
     assert np.all(np.abs(squared.mean(axis=0) - claimed) < 6 * deviation)
 
 
+@pytest.mark.slow
 def test_more_precise_outputs_than_are_unrolled():
     """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
     h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
@@ -203,6 +208,7 @@ def test_more_precise_outputs_than_are_unrolled():
     np.testing.assert_allclose(estimate.mean, left @ h.T @ z / d, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_noise_free_output_has_a_gradient():
     """dx/dP of x = P z / (P + 0) is 0, and of the state that is not received too."""
 
@@ -215,6 +221,7 @@ def test_a_noise_free_output_has_a_gradient():
         assert float(jax.jit(jax.grad(mean))(2.0)) == pytest.approx(0.0, abs=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "left"), [(hg.perfect(1), 1e-28), (hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 1e-9), 1.0)]
 )
@@ -268,6 +275,7 @@ def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
         np.testing.assert_allclose(slope, variance(1e-5) / 1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_data_without_noise_leave_a_variance_above_the_rounding_of_the_mean():
     """Of a state that moves and is seen without noise the claim covers what rounding leaves, smoothed too.
 
@@ -304,6 +312,7 @@ def test_the_covariance_of_an_unstable_plant_held_by_its_inputs_stays(make):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(moved.state))
 
 
+@pytest.mark.slow
 def test_behind_a_random_gain_far_from_zero_a_combination_that_says_nothing_is_left_out():
     """Three outputs of two states are tied and so is the noise of the random gain, of which 1e-6 is not along the mean.
 

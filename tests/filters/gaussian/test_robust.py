@@ -35,6 +35,7 @@ def robust(rule=None, law=None, channel=None, plant=PLANT, output=C):
     return hg.robust_filter(plant, sensor, hg.perfect(len(output)) if channel is None else channel, rule)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [hg.Contaminated(0.5, 0.2, 8.0, 1.5), hg.StudentT(0.5, 3.0)])
 @pytest.mark.parametrize("z", [0.2, 3.0, -6.0])
 def test_the_score_has_the_exact_moments_of_one_component(law, z):
@@ -63,6 +64,7 @@ def test_the_score_has_the_exact_moments_of_one_component(law, z):
     assert innovation.log_likelihood == pytest.approx(np.log(whole), abs=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "item",
     [
@@ -98,6 +100,7 @@ def test_no_single_value_takes_the_estimate_far(rule):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [hg.filters.InverseMultiquadric(), hg.filters.WoLF(1.3), hg.filters.Gate()])
 def test_an_infinitely_far_value_counts_as_missing(rule):
     item = robust(rule)
@@ -108,6 +111,7 @@ def test_an_infinitely_far_value_counts_as_missing(rule):
     assert innovation.weight[0] < 1e-200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES)
 def test_nothing_that_arrives_changes_nothing(rule):
     item = robust(rule)
@@ -151,6 +155,7 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
         assert z.var() == pytest.approx(claimed, abs=4 * np.std((z - z.mean()) ** 2) / 447)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "transform", [hg.filters.Cubature(), hg.filters.Linearization(), hg.filters.Unscented(1.0, 0.0, 1.0)]
 )
@@ -165,6 +170,7 @@ def test_every_transform_serves_a_nonlinear_sensor(transform):
     np.testing.assert_allclose(state.mean, other.mean, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["clean", "outliers", "bursts", "relay", "student", "mixture"])
 def test_where_the_law_is_true_the_covariance_is(column):
     """NEES 0.95 to 1.05 over 40 runs of 400 steps (standard error about 0.01), and errors below the plain filter's."""
@@ -202,6 +208,7 @@ def judged(item, truth, z, first=50):
     return np.sqrt(np.mean(np.sum(e[..., :2] ** 2, axis=-1))), nees
 
 
+@pytest.mark.slow
 def test_the_linear_filter_of_the_second_moments_is_exact():
     """NEES 1 to its sampling error, 0.02, behind a relay too: outliers are noise of larger variance."""
     truth, z = simulated("outliers", 60, 400, 4)

@@ -26,6 +26,7 @@ def bent(x):
     return jnp.stack([x[0] * jnp.cos(x[1]), x[0] * jnp.sin(x[1]), x[0] ** 2])
 
 
+@pytest.mark.slow
 @given(st.floats(0.1, 2.0), st.floats(0.0, 3.0), st.floats(0.0, 3.0), st.integers(0, 1000))
 def test_it_is_the_sum_over_the_printed_points(alpha, beta, kappa, seed):
     rng = np.random.default_rng(seed)

@@ -134,6 +134,7 @@ def _gain(item, state, k):
     return np.stack([item.step(state, unit, (), k)[1].mean - zero for unit in np.eye(2)], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("closed", "low", "high"), [(False, 0.9, 1.1), (True, 0.2, 0.4)])
 def test_a_random_gain_makes_the_claim_one_for_inputs_known_in_advance(closed, low, high):
     """E[(x - m)^2] / P after 15 steps of a = 1.2 with u = -a m, from the estimate or from the mean before data.

@@ -22,6 +22,7 @@ def measurements(outputs, seed=0):
     return np.random.default_rng(seed).normal(size=(HORIZON, outputs))
 
 
+@pytest.mark.slow
 def test_estimates_are_the_papers():
     """(14), repaired, on the same measurements; the full form needs a pseudo-inverse for two sensors."""
     for system, outputs in ((EXAMPLE, 1), (two_sensors(), 2)):
@@ -35,6 +36,7 @@ def test_estimates_are_the_papers():
         np.testing.assert_allclose(bounds, expected.true[1:, :n, :n], rtol=0, atol=1e-11 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_saved_gains_are_the_recursion(degree):
     s, data = model(EXAMPLE, HORIZON), measurements(1)
@@ -76,6 +78,7 @@ def test_nothing_arrives_for_a_while():
     np.testing.assert_allclose(bounds, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_saved_gains_tell_that_their_covariance_is_lost():
     s, data = model(EXAMPLE, HORIZON), measurements(1)
     data[4] = np.nan

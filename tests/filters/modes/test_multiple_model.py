@@ -96,6 +96,7 @@ def test_a_chain_that_varies_leads_from_each_step_to_the_next():
     np.testing.assert_allclose(result.covariance, spread, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_particles_are_close_to_bayes_rule():
     """20,000 particles over six steps, 64 paths: within 4 standard errors of the mean of as many draws."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(DATA))
@@ -223,6 +224,7 @@ def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
 
 
+@pytest.mark.slow
 def test_a_mode_that_losses_show_is_known():
     """Everything lost in one mode, nothing in the other: the Kalman filter that skips, whatever the chain."""
     links = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.erasure(hg.hop(0.8, 0.1), 0.0), 0.2, 0.4)
@@ -268,6 +270,7 @@ def test_a_count_of_particles_is_positive():
         hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=0)
 
 
+@pytest.mark.slow
 def test_particles_depend_on_seed_and_data_alone():
     item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE)
     once, again = stepped(item, DATA)[0], stepped(item, DATA)[0]

@@ -120,6 +120,7 @@ def test_what_cannot_be_observed_is_not_claimed(trap, filters, request):
     assert np.all(true[[0, 2, 3]] < (1 + 3 / np.sqrt(2 * RUNS)) * claimed[[0, 2, 3]])
 
 
+@pytest.mark.slow
 def test_a_true_clock_that_falls_silent_is_none():
     """After as many steps as there are states."""
     plant, _, joint, channel = seen_by("ab")
@@ -131,6 +132,7 @@ def test_a_true_clock_that_falls_silent_is_none():
     assert seen == [True] * 5 + [False] * 3
 
 
+@pytest.mark.slow
 def test_two_wrong_clocks_may_be_wrong_together():
     """Only a third, right, tells them from a shift of everything in time."""
     clocks = {name: hg.model.Clock(*DEVIATION) for name in "bc"}
@@ -143,6 +145,7 @@ def test_two_wrong_clocks_may_be_wrong_together():
         assert same is not expected[0]
 
 
+@pytest.mark.slow
 def test_a_plant_given_as_functions_has_the_same_clocks():
     plant, _, joint, channel = seen_by("ab")
     step = np.array(F)
@@ -162,6 +165,7 @@ def test_a_plant_given_as_functions_has_the_same_clocks():
         np.testing.assert_allclose(both[0][1].covariance, both[1][1].covariance, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_contract():
     plant, _, joint, channel = seen_by("ab")
     check_filter(clock_filter(plant, joint, channel, ["b"]))

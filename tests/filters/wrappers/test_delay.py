@@ -53,6 +53,7 @@ def filters():
     return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNKNOWN)}
 
 
+@pytest.mark.slow
 def test_unknown_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
     received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
     result = true_error(filters["uninformed"], PLANT, SENSOR, UNKNOWN, STEPS)
@@ -123,6 +124,7 @@ def check_that_it_is_the_best(a, c, r, q, weights, gains, noise):
     np.testing.assert_allclose(result, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
 
 
+@pytest.mark.slow
 def test_delays_that_are_a_chain():
     rows, initial = np.array([[0.8, 0.2, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 0.7]]), np.array([0.5, 0.3, 0.2])
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), N, delay=hg.random_affine.MarkovChain(rows, initial))
@@ -133,6 +135,7 @@ def test_delays_that_are_a_chain():
     np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
     """Values received twice, out of order, lost, and too late to be of any step."""
@@ -148,6 +151,7 @@ def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed
     np.testing.assert_array_equal(unknown.mean, state.mean)
 
 
+@pytest.mark.slow
 def test_a_constant_delay_is_predicted_over(filters):
     """Against the filter of all that was sent, which has the same through gaps; with an input, and its innovation."""
     plant = hg.LinearPlant(A, Q, START, SPREAD, input_matrix=[[0.0], [1.0]])

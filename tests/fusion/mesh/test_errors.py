@@ -34,6 +34,7 @@ def central(steps, rows=ROWS):
     return p
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "weights"), [("best", best), ("equal", equal), ("trace", by_trace)])
 def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, weights):
     arrived = hg.simulation.mesh_arrivals(lossy, name, 8, 3)
@@ -120,6 +121,7 @@ def available(arrived):
     return known
 
 
+@pytest.mark.slow
 def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy):
     steps = 5
     arrived = hg.simulation.mesh_arrivals(lossy, "trace", steps, 2)
@@ -154,6 +156,7 @@ def test_no_rule_beats_the_bound(lossy):
         assert np.linalg.eigvalsh(error - bound).min() > -1e-9
 
 
+@pytest.mark.slow
 def test_the_mean_over_losses_is_that_of_all_patterns_listed():
     neighbours = {"a": ["c"], "c": ["a", "d"], "d": ["a"]}
     net = network({"m": hg.fusion.DiffusionWeights()}, neighbours, link=LINK)
@@ -237,6 +240,7 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
             assert ours.covariance == pytest.approx(np.asarray(theirs.covariance[0]), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_one_way_ring_is_not_starved():
     """Two nodes of opposite sides know a state each: a share by trace alone follows the one that is nearer."""
     names = [f"n{i:02}" for i in range(12)]

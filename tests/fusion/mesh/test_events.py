@@ -63,6 +63,7 @@ def by_hand(z, alpha, lost):
     return means, covariances, count / (4 * len(z["a"]))
 
 
+@pytest.mark.slow
 def test_a_run_is_that_by_hand_and_sends_the_less_the_larger_alpha(record):
     z = {name: np.asarray(record.measurements[name][0]) for name in NODES}
     shares = []

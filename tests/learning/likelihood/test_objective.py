@@ -43,6 +43,7 @@ def points(objective):
     return start + np.random.default_rng(1).uniform(-1.5, 1.5, (3, len(start)))
 
 
+@pytest.mark.slow
 def test_native_code_computes_what_the_compiler_of_jax_does(both):
     objective, data = both
     x = points(objective)

@@ -62,6 +62,7 @@ def test_its_gradient_is_that_of_differences(bursts):
     np.testing.assert_allclose(runs.likelihood(LOGITS)[1], differences, rtol=1e-6)  # of central differences
 
 
+@pytest.mark.slow
 def test_it_finds_the_modes_it_was_drawn_from(learned):
     result = learned.laws["hidden"].shares()
     for name, truth in {"good_loss": 0.05, "bad_loss": 0.7, "fail": 0.03, "recover": 0.15}.items():
@@ -155,6 +156,7 @@ def test_independent_losses_are_said_from_bursts():
     assert result.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["independent", "markov", "markov_4", "hidden"])
 def test_a_law_is_a_channel_with_its_losses(learned, name):
     """Long-run losses of the channel against those of the law; 4,000 drawn packets in bursts: three standard errors."""

@@ -115,6 +115,7 @@ def test_the_error_is_that_of_the_recursion(problem):
     np.testing.assert_allclose(result, parts.sum(axis=0), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     problem = problem_of("observed losses")
     result = problem.at(problem.numbers.start)
@@ -156,6 +157,7 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     assert result.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
+@pytest.mark.slow
 def test_a_relay_is_placed_where_the_closed_form_puts_it():
     """One state, two hops, loss d^-3: above rho = 4 the best site leaves the middle, x (1 - x) = 1 / rho."""
     rho = 8.0
@@ -234,6 +236,7 @@ def test_bad_numbers_are_named(free, message):
         hg.design(one_hop, free=free, budget=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [hg.erasure, hg.dropout])
 @pytest.mark.parametrize("budget", [None, 1.0])
 def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budget):
@@ -248,6 +251,7 @@ def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budge
     assert 0.1 < least.numbers["arrival"] < 0.9 and least.error <= best.error * 1.1 * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 2.0), (0.1, -np.inf)])
 def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, high, monkeypatch):
     monkeypatch.setattr("heliograph.planning.numbers.design.search", None)

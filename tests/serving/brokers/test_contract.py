@@ -155,6 +155,7 @@ def test_another_order_of_what_comes_again_is_allowed_and_informed():
     assert not check_transport(Late(), patience=5.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("broker", "what"),
     [

@@ -71,6 +71,7 @@ def base(place: str, item: hg.Network) -> np.ndarray:
     return here.pool.table[plant.rows.held[0].slot, here.pool.state].reshape(4, -1)
 
 
+@pytest.mark.slow
 def test_another_noise_goes_on_from_the_state_that_was_and_is_named(tmp_path):
     place = stored(tmp_path / "a.db", network())
     mean, variance, level, spread = base(place, network())[:, 0]
@@ -94,6 +95,7 @@ def test_another_noise_goes_on_from_the_state_that_was_and_is_named(tmp_path):
     Store(place, identity(fleet(network(0.09)))).close()  # it is the store of the new network now
 
 
+@pytest.mark.slow
 def test_a_new_sensor_begins_alone_and_one_that_left_goes_alone(tmp_path):
     """The nodes' order changes too: b was second of (a, b), is last of (c, b), and of (b, a)."""
     calm = Service(fleet(network()), Store(str(tmp_path / "calm.db"), identity(fleet(network()))))
@@ -149,6 +151,7 @@ def test_what_cannot_be_carried_over_is_refused_and_nothing_is_changed(tmp_path)
     Store(place, identity(fleet(network()))).close()
 
 
+@pytest.mark.slow
 def test_rows_of_single_events_and_inputs_in_continuous_time_are_carried_over(tmp_path):
     """Each event has a row of its own there, whose key has the place of its node."""
     item = moving()

@@ -58,6 +58,7 @@ def states(service):
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_service_that_dies_at_any_commit_ends_with_the_same_bits(tmp_path, whole):
     network = stepping() if whole else moving()

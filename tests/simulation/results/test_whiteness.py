@@ -64,6 +64,7 @@ def test_bad_input():
         hg.simulation.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))
 
 
+@pytest.mark.slow
 def test_what_an_output_says_again_adds_nothing_to_the_innovations():
     """A sensor that reads the state twice without noise: the second reading has nothing new to say."""
     plant = hg.LinearPlant([[0.8]], noise=hg.Gaussian([[1.0]]), initial_mean=[0.0], initial_covariance=[[1.0]])

@@ -78,6 +78,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
         np.testing.assert_allclose(getattr(sums, name), getattr(stored, name), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_columns_of_what_relays_received_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, local_error_design(net, 4))
@@ -119,6 +120,7 @@ class Counted(hg.random_affine.AbstractNoise):
         return {1: 0.0, 2: self.rate, 3: self.rate}[powers[0]]
 
 
+@pytest.mark.slow
 def test_a_noise_of_counts_is_simulated():
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     sensor = hg.LinearSensor([[1.0]], Counted(4.0))

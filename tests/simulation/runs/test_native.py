@@ -102,6 +102,7 @@ def by(engine: str, monkeypatch: pytest.MonkeyPatch, *args: object, **kwargs: ob
     return hg.monte_carlo(*args, **kwargs)
 
 
+@pytest.mark.slow
 @daily("linear", "shadowed")
 def test_records_are_those_of_xla(networked, monkeypatch):
     """Draws to the last bits, estimates to 1e-12 of what deviates from step to step."""
@@ -120,6 +121,7 @@ def test_records_are_those_of_xla(networked, monkeypatch):
             assert item.claim == true.claim
 
 
+@pytest.mark.slow
 @daily("with memory", "shadowed")
 def test_statistics_are_those_of_xla(networked, monkeypatch):
     network, u = networked
@@ -189,6 +191,7 @@ def code(network: hg.Network, seed: int = 0):
         return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories())
 
 
+@pytest.mark.slow
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
     """A few at a time: each node's numbers are those of a network of its own."""
     monkeypatch.setenv(SETTING, "native")
@@ -239,6 +242,7 @@ def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
     assert [len(part) for part in results["xla"]] == [3, 35]
 
 
+@pytest.mark.slow
 def test_keys_of_another_hash_are_simulated_by_xla():
     network = shadowed()
     record = hg.monte_carlo(network, 3, 2, jax.random.key(0, impl="rbg"))

@@ -31,6 +31,7 @@ def test_choices_are_the_best_by_enumeration():
     assert choose_sensors(PATHS, 6, 6.0).bound == pytest.approx(error_at(PATHS, np.full(6, 6.0)), rel=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_the_bound_of_a_choice_is_the_least_error_of_shares(count):
     """By a plain descent in the shares, which knows no paths whose powers are shares."""
@@ -47,6 +48,7 @@ def test_the_bound_of_a_choice_is_the_least_error_of_shares(count):
     assert bound == pytest.approx(descent.fun, rel=1e-6)  # slopes by differences leave 1e-8 in a share
 
 
+@pytest.mark.slow
 def test_sensors_that_tell_nothing_are_no_worse_than_their_bound():
     """Without power all that is left is the plant's own covariance; a sensor of no row cannot help either."""
     plain = choose_sensors(PATHS, 2, 0.0)

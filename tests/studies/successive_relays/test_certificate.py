@@ -43,6 +43,7 @@ def test_the_bounds_of_the_example(paper):
         assert bounds[name].failing == ("largest eigenvalue of A A' below 1: 1.2616",)
 
 
+@pytest.mark.slow
 def test_tuned_gains_leave_the_bounds_proofs():
     tuned = certify_relays(example(), receiver_error_design(example(), 100, sweeps=20).gains)
     state = tuned.bounds["state covariance"]
@@ -70,6 +71,7 @@ def test_every_bound_can_fail():
         assert not bounds[name].applies and bounds[name].holds is False
 
 
+@pytest.mark.slow
 def test_a_network_of_another_kind_gets_the_bounds_that_still_make_sense():
     net = unusual()
     bounds = certify_relays(net, local_error_design(net, 9).gains).bounds
