@@ -13,7 +13,7 @@ from heliograph import filters
 from tests.filters.test_noise_free import EPS, GAIN, chain, of_rank
 from tests.follow import follow_each
 
-STEPS, RUNS, NETWORKS = 15, 8, 100
+STEPS, RUNS, NETWORKS = 15, 8, 400
 
 
 def small(random, size):

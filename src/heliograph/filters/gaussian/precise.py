@@ -35,7 +35,7 @@ class Component(NamedTuple):
     """One component of T z, whose rows make the noises of the components uncorrelated.
 
     Shapes: number e_j (m,), row T H of it and its rounding in eps, size (n,), the variance of noise and rounding () and
-    that of noise alone (), least variance that is not rounding (); or of all components, one axis more. Runs last.
+    that of noise alone (); or of all components, one axis more. Runs last.
     """
 
     number: jax.Array
@@ -43,7 +43,6 @@ class Component(NamedTuple):
     size: jax.Array
     variance: jax.Array
     noise: jax.Array
-    least: jax.Array
 
 
 def precise_update(
@@ -69,11 +68,11 @@ def precise_update(
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
     # Square root of P, and the components of z with uncorrelated noises.
     start = root(prior)
-    turn, components = _components(start, output, noise, rounded)
+    turn, components = _components(output, noise, rounded)
     nothing = jnp.zeros((n, m, *runs), start.dtype)
     unit = (n + 2) * float(np.finfo(start.dtype).eps)
     mean = jnp.broadcast_to(diagonal(unit * jnp.sqrt(jnp.maximum(diagonal_of(prior), 0.0))), (n, n, *runs))
-    begin = _Taken(jnp.broadcast_to(start, (n, n, *runs)), mean, nothing, nothing)
+    begin = _Taken(*(jnp.broadcast_to(a, (n, n, *runs)) for a in (start, jnp.abs(start))), mean, nothing, nothing)
     taken = jax.lax.scan(_use_component, begin, components)[0]
     gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise) + times(gain * rounded[None], transpose(gain))
@@ -81,9 +80,7 @@ def precise_update(
     return times(taken.whole, turn), after + diagonal(_lost(prior, remaining, after))
 
 
-def _components(
-    start: jax.Array, output: jax.Array, noise: jax.Array, rounded: jax.Array
-) -> tuple[jax.Array, Component]:
+def _components(output: jax.Array, noise: jax.Array, rounded: jax.Array) -> tuple[jax.Array, Component]:
     """T (m, m) and the components of T z, with the rounding that the elimination leaves in each row.
 
     T H is off by eps |T| (|H| + W |T H|), W_ji = |L_ji| and what of it cancelled, at most root(N_jj N_ii) / D_i, for
@@ -100,15 +97,13 @@ def _components(
     earlier = np.tri(m, k=-1).reshape(m, m, *[1] * (noise.ndim - 2))
     tied = jnp.minimum(deviation[:, None] * deviation[None], times(jnp.abs(whole), transpose(jnp.abs(turn))))
     size = times(jnp.abs(turn), jnp.abs(output) + times(earlier * (tied / safe[None]), jnp.abs(rows)))
-    reach = times(size, jnp.abs(start))
-    eps = float(np.finfo(start.dtype).eps)
-    least = ((n + 2) * eps * LEFT) ** 2 * summed(reach * reach, 1)
+    eps = float(np.finfo(output.dtype).eps)
     # Variance of each component: by its noise, where that is more than rounding of the noises of z, and by rounding.
     square, spread = turn * turn, times(turn, root(noise))
     fresh = summed(spread * spread, 1)
     fresh = jnp.where(fresh > (LEFT * eps) ** 2 * times_vector(square, diagonal_of(noise)), fresh, 0.0)
     variance = jnp.maximum(pivot, times_vector(square, rounded))
-    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, fresh, least)
+    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, fresh)
 
 
 def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
@@ -121,10 +116,12 @@ def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array
 class _Taken(NamedTuple):
     """State after some components: roots of P and of the mean's rounding, R (n, n), and two gains of T z (n, m).
 
-    gain: of components of which more than rounding was unknown, which P+ is made of; whole: of all.
+    doubt: rounding of the root of P, in eps (n, n); gain: of components of which more than rounding was unknown, which
+    P+ is made of; whole: of all.
     """
 
     root: jax.Array
+    doubt: jax.Array
     rounded: jax.Array
     gain: jax.Array
     whole: jax.Array
@@ -132,10 +129,13 @@ class _Taken(NamedTuple):
 
 def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     """Roots and gains with one component more."""
-    before, rounded, gain, whole = state
+    before, doubt, rounded, gain, whole = state
     f = times_vector(transpose(before), component.row)
     total = summed(f * f, 0) + component.variance
-    used = total > component.least
+    # f is off by its reach, in eps; a component of which no more is left than that says nothing.
+    reach, eps = times_vector(transpose(doubt), component.size), float(np.finfo(f.dtype).eps)
+    off = summed(reach * reach, 0)
+    used = total > ((len(before) + 2) * eps * LEFT) ** 2 * off
     safe = jnp.where(used, total, 1.0)
     shared = times_vector(before, f)
     column = jnp.where(used, shared / safe, 0.0)
@@ -144,16 +144,17 @@ def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
     news = component.number - times_vector(transpose(gain), component.row)
     # A component of which P leaves nothing unknown corrects the mean's rounding, by the root of that alone.
-    g, reach = (
-        times_vector(transpose(rounded), component.row),
-        times_vector(transpose(jnp.abs(rounded)), component.size),
-    )
+    g = times_vector(transpose(rounded), component.row)
+    reach = times_vector(transpose(jnp.abs(rounded)), component.size)
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
     corrects = ~used & (size > least)
     step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size + component.noise, 1.0), column)
     rounded = rounded - step[:, None] * g[None]
     whole = whole + step[:, None] * (component.number - times_vector(transpose(whole), component.row))[None]
-    return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None
+    # The root is off by the part of f that is: more than before where the components before left little of this one.
+    less = shared[:, None] * turned[None]
+    doubt = doubt + jnp.sqrt(off / safe) * jnp.abs(less)
+    return _Taken(before - less, doubt, rounded, gain + column[:, None] * news[None], whole), None
 
 
 class HasStart(Protocol):
