@@ -88,7 +88,7 @@ def _components(output: jax.Array, noise: jax.Array, rounded: jax.Array) -> tupl
     that are tied leave small D_i, as does the power of a random gain and a mean far from zero; no D_i is below what
     rounding alone gives to the component.
     """
-    m, n = output.shape[:2]
+    m = len(output)
     ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
     whole = noise + diagonal(rounded)
     turned, pivot = uncorrelated(whole, jnp.concatenate([ones, output], axis=1))

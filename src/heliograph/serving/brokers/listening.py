@@ -88,6 +88,8 @@ async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic
             token=None if address.password else address.user,
             tls=address.tls(),
             allow_reconnect=False,
+            max_reconnect_attempts=1,  # also before the first connection, where the client would try for two minutes
+            reconnect_time_wait=0,
             connect_timeout=int(WAIT),
             error_cb=ignored,
         )
