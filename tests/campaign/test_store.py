@@ -88,6 +88,7 @@ def spoil(path, how):
         path.write_bytes(data[:half] + bytes([data[half] ^ 1]) + data[half + 1 :])
 
 
+@pytest.mark.slow
 def test_a_damaged_chunk_is_named_and_computed_again(tmp_path, finished, expected, capsys, monkeypatch):
     write(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -197,6 +198,7 @@ def test_no_scheduler_is_one_line(tmp_path, address, capfd, monkeypatch):
     assert time.monotonic() - begun < 40 and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of the cluster's own end
 def test_a_scheduler_that_dies_is_one_line_and_the_next_run_goes_on(tmp_path, expected, monkeypatch):
     from dask import config
@@ -250,6 +252,7 @@ def test_leftovers_of_killed_processes_go_with_the_next_run(tmp_path, expected):
 NAMES = NETWORK.replace('"near"', 'r"[/red]$\\bad{$"').replace('"trusting"', "\"=cmd|' /C calc'!A0\\x1b[31m\"")
 
 
+@pytest.mark.slow
 def test_names_end_no_campaign_and_act_in_no_page(tmp_path, capsys, monkeypatch):
     write(tmp_path, CAMPAIGN.replace("[0.5, 0.7, 0.9]", '[0.5, 0.9]\nkind = ["@one"]'), NAMES)
     monkeypatch.chdir(tmp_path)

@@ -67,6 +67,7 @@ def test_every_filter_gives_what_xla_gives(name):
         assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cubature", "imm"])
 def test_bits_depend_on_no_width_and_no_neighbour(name):
     """Of one run alone, of 13 in blocks of 8, 4 and 16, by one core and by several."""

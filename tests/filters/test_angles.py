@@ -250,6 +250,7 @@ def test_what_a_full_turn_changes_is_no_circle():
         hg.cubature_filter(plant, hg.LinearSensor([[1.0]], 1.0), hg.perfect())
 
 
+@pytest.mark.slow
 def test_a_plant_says_how_states_differ():
     plant = robot(1.0)
     x, other = np.array([[1.0, 2.0, 3.1]]), np.array([[0.0, 0.0, -3.1]])

@@ -93,6 +93,7 @@ def test_optimal_is_best_and_no_worse_than_any_input(seed):
     assert trace["InverseCovarianceIntersection"] <= best_input * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_inverse_covariance_intersection_is_the_oracles():
     bounds = covariances(5, 2, 3, spread=0.3)
     pair = estimates(bounds)
@@ -132,6 +133,7 @@ def test_a_fused_claim_is_never_stronger_than_its_weakest_input():
     assert hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), estimates(bounds, "exact")).claim == "nominal"
 
 
+@pytest.mark.slow
 def test_leading_axes_are_carried_along():
     bounds = np.stack([covariances(s, 3, 2) for s in range(4)])
     together = hg.fusion.fuse(hg.fusion.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))

@@ -63,6 +63,7 @@ def test_with_all_known_it_is_matrix_weights_and_with_nothing_known_intersection
     assert np.trace(nothing.covariance) == pytest.approx(np.trace(intersected.covariance), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_no_split_is_refused():
     known, unknown = parts(3)
     rule = hg.fusion.SplitIntersection(known)

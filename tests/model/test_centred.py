@@ -124,6 +124,7 @@ def test_angles_stay_angles() -> None:
         hg.cubature_filter(plant, compass, centred(hg.hop(GAIN, 0.1), 0.4))
 
 
+@pytest.mark.slow
 def test_bad_references_are_one_clear_line() -> None:
     with pytest.raises(ValueError, match=r"reference: expected shape \(1\), got shape \(2,\)"):
         centred(RELAYED, [1.0, 2.0])

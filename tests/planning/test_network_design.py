@@ -169,6 +169,7 @@ def test_an_unobserved_loss_is_fading(single):
     assert hg.design(network, budget=1).present == pytest.approx(np.trace(steady), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wire_passes_on_what_its_sensor_measures(single):
     wired = hg.Node(hg.LinearSensor(ROWS[2:3], NOISES[2]), hg.perfect(), {})
     network = hg.Network(single.plant, {"wired": wired, "a": single.nodes["a"]})

@@ -47,6 +47,7 @@ def test_draws_have_the_moments_and_the_memory_that_they_state(name):
     check_random_affine(CHANNELS[name])
 
 
+@pytest.mark.slow
 def test_the_square_of_a_link():
     check_random_affine(hg.random_affine.square(link()), highest=2)
 

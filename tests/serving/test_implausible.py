@@ -89,6 +89,7 @@ def test_limits_hold_here_too_and_it_is_said_once():
     assert hidden.lanes.network is not network
 
 
+@pytest.mark.slow
 def test_a_filter_that_alone_leaves_a_value_out_says_so():
     plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5)
     lost = hg.linear_filter(

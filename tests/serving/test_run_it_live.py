@@ -83,6 +83,7 @@ def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, cap
     )
 
 
+@pytest.mark.slow
 def test_the_state_is_stored_next_to_the_network_by_default(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Path("net.py").write_text(SMALL)

@@ -132,6 +132,7 @@ def test_scores_of_made_up_errors():
     assert score.nees_per_dimension["low"] < score.nees_per_dimension["mean"] < score.nees_per_dimension["high"]
 
 
+@pytest.mark.slow
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     truth = np.tile(RUNNING[:5] / RATED[:5], (4000, 1))
     result = compute.received(truth, 0)

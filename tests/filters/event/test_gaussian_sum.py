@@ -67,6 +67,7 @@ def test_the_posterior_of_silence_has_no_more_covariance_than_silence_skipped():
     assert np.all(variance <= skipped * (1 + 1e-4))  # 1e-4: the grid
 
 
+@pytest.mark.slow
 def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     trigger = hg.SendOnDelta(5.0, heartbeat=1)
     z, _ = simulated(LOSSY, trigger, 40)
@@ -76,6 +77,7 @@ def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     np.testing.assert_allclose(result.covariance, kalman.covariance, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_delta_near_zero_is_the_kalman_filter_with_erasures():
     trigger = hg.SendOnDelta(1e-5)
     z, _ = simulated(LOSSY, trigger, 60)
@@ -98,6 +100,7 @@ def test_a_wide_delta_sends_the_first_value_alone():
     np.testing.assert_allclose(result.mean, kalman.mean, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_certain_loss_leaves_the_prior():
     """Every value is lost, so that silence says nothing: to the joining of the sum, 1 % of a variance."""
     channel, trigger = hg.erasure(hg.perfect(), 0.0), hg.SendOnDelta(0.6)

@@ -73,6 +73,7 @@ def cases():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(cases()), ids=lambda c: f"{c[0]}, {c[1]}")
 def test_bounded_filters_are_the_oracles_recursion(case):
     name, _, build, update, predict, reference = case

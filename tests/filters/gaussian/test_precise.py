@@ -111,6 +111,7 @@ def test_what_rounding_leaves_of_a_variance_is_right_or_is_no_less():
     assert 0 < lost < WIDE.size * PRECISE.size * STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tied", [0.0, 0.9])
 def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     """The condition of S is 1e9, its solution is that many times rounding off; one after another they are not.

@@ -70,6 +70,7 @@ def test_a_false_claim_is_found(behind_fading):
     assert worst.z > 5 and worst.ratio > 2
 
 
+@pytest.mark.slow
 def test_time_varying_parts_are_read_at_their_step():
     horizon = 5
     channels = hg.model.over_time([hg.hop(0.2 + 0.3 * k, 0.05, dimension=2) for k in range(horizon)])

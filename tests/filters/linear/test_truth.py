@@ -72,6 +72,7 @@ ONE_MEAN = Modes(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "matters"),
     [

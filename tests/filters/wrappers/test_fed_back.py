@@ -47,6 +47,7 @@ def test_the_covariance_is_that_of_the_formula(statistics: dict[str, dict[str, h
     np.testing.assert_allclose(statistics["sure"]["fed"].claimed(), results, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_sensor_takes_off_what_it_sends_of_the_prediction() -> None:
     """By hand: r = h(f(xhat)), and the gain's noise sees Var y + (E y - r)^2."""
     plant = hg.Plant(lambda x, u: jnp.sin(x) + 1, 0.1, [2.0], [[0.2]])

@@ -110,6 +110,7 @@ def test_a_step_is_one_program_whatever_the_number_of_nodes():
     assert operations(12) == operations(48)
 
 
+@pytest.mark.slow
 def test_a_link_for_each_edge(lossy):
     edges = ["b to a", "c to b", "d to b", "a to c", "b to c", "c to d"]
     net = network({"trace": RULES["trace"]}, link={name: LINK if name == "b to a" else hg.perfect() for name in edges})

@@ -205,6 +205,7 @@ def test_powers_and_amplifications_agree():
     assert capped.powers["node.hop1"][0] == pytest.approx(0.5, rel=1e-6) and capped.error > by_power.error
 
 
+@pytest.mark.slow
 def test_numbers_marked_where_they_stand_are_free():
     def marked():
         law = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3])
@@ -265,6 +266,7 @@ def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, h
         hg.design(built, free={"noise": ends}, budget=1.0)
 
 
+@pytest.mark.slow
 def test_an_end_that_is_never_reached_may_be_none():
     """A transmitter without power is refused; one of any power above zero is not."""
 

@@ -144,6 +144,7 @@ def test_a_snapshot_is_carried_over_and_stays_as_it_is(tmp_path):
         opened.close()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_carried_over_is_refused_and_nothing_is_changed(tmp_path):
     place = stored(tmp_path / "a.db", network())
     with pytest.raises(ValueError, match=r"expected the states that are stored, 'level', .*, got 'height'"):

@@ -63,6 +63,7 @@ def test_the_error_is_the_simulated_one() -> None:
     assert np.max(np.abs(received.mean(axis=0) - 1.02 * (3.0 + 0.2)) / errors) < 4
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     st.lists(st.floats(-1.3, 1.3).filter(lambda v: abs(abs(v) - 1) > 0.05), min_size=2, max_size=2, unique=True),

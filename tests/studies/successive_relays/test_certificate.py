@@ -28,6 +28,7 @@ def scalar(transition, initial, mean=0.5):
     return RelayNetwork(plant, LinearSensor([[1.0]], [[1.0]]), ("a", "b"), slots)
 
 
+@pytest.mark.slow
 def test_the_bounds_of_the_example(paper):
     bounds = paper.bounds
     assert paper.constants["tau_upper"] == pytest.approx(1.2616, abs=5e-5)
