@@ -110,7 +110,7 @@ def _over_one_more(
 ) -> tuple[list[jax.Array], list[int]]:
     size = next(x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None)
     moved = [
-        jnp.expand_dims(x, x.ndim) if axis is None else jnp.moveaxis(x, axis, -1)
+        jnp.expand_dims(x, jnp.ndim(x)) if axis is None else jnp.moveaxis(x, axis, -1)
         for x, axis in zip(leaves, axes, strict=True)
     ]
     results = _kernel.bind(*moved, runs=(*runs, size), **rest)
