@@ -71,8 +71,10 @@ def mixed_innovation(
         total: its innovation covariance (parts, m, m).
         density: log-likelihood of z under the mixture.
     """
-    mean = weight @ value
-    apart = value - mean
+    # About the first: of values so large that all are equal nothing is left, and no rounding to be squared.
+    apart = value - value[0]
+    mean = value[0] + weight @ apart
+    apart = apart - weight @ apart
     covariance = jnp.einsum("a,aij->ij", weight, total) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
     nothing = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
     return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))

@@ -80,12 +80,13 @@ def above_products(product: jax.Array, a: Array, p: jax.Array) -> jax.Array:
 
     The product is off by some eps |A| |P| |A|', of which n (n + 2) eps sum_j A_ij^2 P_jj on the diagonal takes care.
     What a step leaves of that is large against the variance where states that are tied cancel, and the next steps
-    may multiply it. Where the product is zero, nothing was rounded.
+    may multiply it. Where the product is zero, nothing was rounded; where little of its sums cancels, as of second
+    moments about a mean far from zero, that is no more than its last digits.
     """
     n, left = a.shape[1], diagonal_of(product)
     reach = times_vector(a * a, jnp.maximum(diagonal_of(p), 0.0))
     rounded = n * (n + 2) * float(np.finfo(product.dtype).eps) * reach
-    return product + diagonal(jnp.where(left != 0, rounded, 0.0))
+    return product + diagonal(jnp.where((left != 0) & (left < 1e-3 * reach), rounded, 0.0))
 
 
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
