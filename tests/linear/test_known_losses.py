@@ -11,7 +11,7 @@ from heliograph.linear.known_losses import (
     operator,
     steady,
 )
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.random_affine.modes import long_run_law
 from heliograph_studies.intermittent_observations import setting
 from heliograph_studies.intermittent_observations.mean_error import mean_error

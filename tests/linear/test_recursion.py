@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.linear.recursion import covariance_step
-from heliograph.numerics.linalg import pseudo_solve
+from heliograph.numerics.lapack import pseudo_solve
 from heliograph_studies.quadratic_bias import compute
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors

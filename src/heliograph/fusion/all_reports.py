@@ -13,7 +13,8 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import RANK
-from heliograph.numerics.linalg import pseudo_solve, rounding, symmetrize, with_rounding
+from heliograph.numerics.lapack import pseudo_solve
+from heliograph.numerics.linalg import rounding, symmetrize, with_rounding
 from heliograph.numerics.types import Float
 
 

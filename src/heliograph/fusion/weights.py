@@ -10,7 +10,8 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, probabilities, shown
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.linalg import pseudo_solve, regular_solve, rounding, symmetrize
+from heliograph.numerics.lapack import pseudo_solve, regular_solve
+from heliograph.numerics.linalg import rounding, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error

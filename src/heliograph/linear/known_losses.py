@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import pseudo_solve, spectral_radius
+from heliograph.numerics.lapack import pseudo_solve, spectral_radius
 from heliograph.numerics.types import Float, Int
 
 BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it

@@ -12,7 +12,8 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
-from heliograph.numerics.linalg import spectral_radius, with_rounding
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.linalg import with_rounding
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, Series

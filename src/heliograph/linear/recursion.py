@@ -8,7 +8,8 @@ import numpy as np
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
-from heliograph.numerics.linalg import PRECISE, pseudo_solve, spectral_radius, with_rounding
+from heliograph.numerics.lapack import pseudo_solve, spectral_radius
+from heliograph.numerics.linalg import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
 SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way

@@ -13,7 +13,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, standard_deviations
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise

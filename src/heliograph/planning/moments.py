@@ -13,7 +13,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, refuse_angles
 from heliograph.numerics.check import fail
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise

@@ -14,7 +14,7 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment

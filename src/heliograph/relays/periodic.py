@@ -11,7 +11,7 @@ from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (

@@ -21,7 +21,7 @@ from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories

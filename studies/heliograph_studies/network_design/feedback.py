@@ -18,7 +18,7 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, fail, items, per_step, shown
-from heliograph.numerics.linalg import spectral_radius
+from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.combine import GainAndNoise

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.event.parts import CERTAIN, Parts
 from heliograph.filters.event.truncated_normal import truncated_normal
-from heliograph.numerics.linalg import eigh
+from heliograph.numerics.lapack import eigh
 
 MOST_COMPONENTS = 3  # nodes are a grid over all but one of them
 REACH = 9.0  # deviations from the centre beyond which there is no probability that counts

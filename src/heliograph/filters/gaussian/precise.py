@@ -72,7 +72,8 @@ def precise_update(
     nothing = jnp.zeros((n, m, *runs), start.dtype)
     unit = (n + 2) * float(np.finfo(start.dtype).eps)
     mean = jnp.broadcast_to(diagonal(unit * jnp.sqrt(jnp.maximum(diagonal_of(prior), 0.0))), (n, n, *runs))
-    begin = _Taken(*(jnp.broadcast_to(a, (n, n, *runs)) for a in (start, jnp.abs(start))), mean, nothing, nothing)
+    whole = jnp.broadcast_to(start, (n, n, *runs))
+    begin = _Taken(whole, jnp.abs(whole), mean, nothing, nothing)
     taken = jax.lax.scan(_use_component, begin, components)[0]
     gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise) + times(gain * rounded[None], transpose(gain))

@@ -20,7 +20,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import pseudo_solve
+from heliograph.numerics.lapack import pseudo_solve
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 

@@ -30,7 +30,8 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import PRECISE, pseudo_solve, rounding, spread_of, symmetrize
+from heliograph.numerics.lapack import pseudo_solve
+from heliograph.numerics.linalg import PRECISE, rounding, spread_of, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments

@@ -32,7 +32,8 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import eigh, symmetrize
+from heliograph.numerics.lapack import eigh
+from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
 

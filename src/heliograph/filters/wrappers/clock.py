@@ -22,7 +22,8 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import eigh, symmetrize
+from heliograph.numerics.lapack import eigh
+from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.moments.second_moments import SecondOrder
 

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.fusion.intersection import inverse
-from heliograph.numerics.linalg import add, diagonal_of, identity, regular_solve, symmetric, written_solver
+from heliograph.numerics.lapack import regular_solve
+from heliograph.numerics.linalg import add, diagonal_of, identity, symmetric, written_solver
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Bool, Float
 

@@ -1,0 +1,52 @@
+"""Eigenvalues and solves by LAPACK, for matrices of which a step takes one at a time."""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import sequential_vmap
+
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Float
+
+A = TypeVar("A", jax.Array, np.ndarray)
+
+
+def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
+    """Eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
+
+    A batch at once is dealt out to the processor's threads by a call that waits for them on one of them: programs that
+    run side by side on as many threads then wait for each other for ever.
+    """
+    values, vectors = _eigh(a)
+    return values, vectors
+
+
+def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
+    """A^+ B for a positive semidefinite A, by its correlation matrix, so that units do not matter; NumPy or JAX.
+
+    Directions with an eigenvalue below `tolerance` of the largest are skipped, as are rows of zeros.
+    """
+    xp = library(a, b)
+    deviation = xp.sqrt(xp.maximum(xp.diagonal(a), 0.0))
+    scale = xp.where(deviation > 0, 1 / xp.where(deviation > 0, deviation, 1.0), 0.0)
+    values, vectors = (np.linalg.eigh if xp is np else eigh)(scale[:, None] * a * scale)
+    used = values > tolerance * values[-1]
+    unit = scale[:, None] * vectors
+    solution: A = (unit * xp.where(used, 1 / xp.where(used, values, 1.0), 0.0)) @ (unit.T @ b)
+    return solution
+
+
+def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
+    """The largest modulus of an eigenvalue."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def regular_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:
+    """Solve A X = B for a regular A; of a batch one after another, as `eigh`."""
+    return jnp.asarray(_regular_solve(a, b))
+
+
+_eigh = sequential_vmap(lambda a: tuple(jnp.linalg.eigh(a)))  # type: ignore[no-untyped-call]
+_regular_solve = sequential_vmap(jnp.linalg.solve)  # type: ignore[no-untyped-call]
