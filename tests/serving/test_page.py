@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+import socket
 import urllib.request
 from collections.abc import Awaitable, Callable
 from urllib.error import HTTPError
@@ -152,6 +153,32 @@ def test_a_page_of_elsewhere_that_takes_our_name_does_not_get_in():
         assert (await got(f"{url}/metrics", Host="localhost:80"))[0] == 200
 
     looked(look, Scripted())
+
+
+def test_a_page_that_is_open_does_not_hold_a_service_that_ends(capfd):
+    """Its server waited a second for the reader, then wrote a traceback."""
+    reader = socket.socket()
+
+    async def look(url: str) -> None:
+        host, port = url.removeprefix("http://").split(":")
+        reader.connect((host, int(port)))
+        reader.sendall(f"GET /events HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        assert b"200 OK" in await asyncio.to_thread(reader.recv, 15)
+
+    with reader:
+        looked(look, Scripted())
+    assert capfd.readouterr().err == ""
+
+
+def test_many_nodes_have_one_warning_of_a_kind():
+    watch, service = Watch(["x", "v"]), Scripted(nodes=5)
+    watch.over(service).take([b"0"])
+    for i, link in enumerate(service.plants["mower"].links.values()):
+        link.late, link.future = i, int(i == 3)
+    late, clock = watch.view(None)["warnings"]
+    assert late.startswith("node 1, node 2, node 3, node 4: 10 came too late") and clock.startswith(
+        "node 3: 1 are later"
+    )
 
 
 async def drawn(url: str) -> str:

@@ -7,7 +7,7 @@ import json
 import os
 import socket
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from typing import NamedTuple
 
@@ -163,8 +163,8 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def application(watch: Watch, token: str | None) -> Starlette:
-    """Return the web application: the page at /, its data at /events, metrics at /metrics."""
+def application(watch: Watch, token: str | None, stopped: asyncio.Event) -> Starlette:
+    """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics."""
     tallies = Tallies(watch)
 
     # The first view is written into the page; all others come from /events.
@@ -176,7 +176,7 @@ def application(watch: Watch, token: str | None) -> Starlette:
         return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
 
     def events(request: Request) -> Response:
-        return StreamingResponse(_events(watch, request), media_type="text/event-stream")
+        return StreamingResponse(_events(watch, request, stopped), media_type="text/event-stream")
 
     # The token is checked for every route.
     middleware = [Middleware(Guarded, token)]
@@ -196,16 +196,17 @@ def file(request: Request) -> Response:
     return Response(_text(name), media_type=KINDS[name], headers=POLICY)
 
 
-async def _events(watch: Watch, request: Request) -> AsyncIterator[str]:
+async def _events(watch: Watch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
     """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
     plant, since, before = request.query_params.get("plant"), 0, None
-    while not await request.is_disconnected():
+    while not (stopped.is_set() or await request.is_disconnected()):
         view = await asyncio.to_thread(watch.view, plant, since)
         plant, since = view["plant"] if view["points"] else plant, view["newest"]
         known = json.dumps(view)
         yield f"data: {known}\n\n" if known != before else ": \n\n"
         before = known
-        await asyncio.sleep(EVERY)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(stopped.wait(), EVERY)
 
 
 class Guarded:
@@ -256,15 +257,18 @@ async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
     try:
         listener = socket.create_server((at.host, at.port), family=_family(at.host))
     except OSError as error:
-        raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {error.strerror}") from None
+        why = str(error.strerror).split(" (")[0]  # without the address again
+        raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {why}") from None
+    stopped = asyncio.Event()
     config = uvicorn.Config(
-        application(watch, at.token), log_level="warning", access_log=False, timeout_graceful_shutdown=1
+        application(watch, at.token, stopped), log_level="warning", access_log=False, timeout_graceful_shutdown=3
     )
     server = _Page(config)
     serving = asyncio.ensure_future(server.serve([listener]))
     try:
         yield int(listener.getsockname()[1])
     finally:
+        stopped.set()  # readers of the page would hold the server
         server.should_exit = True
         await serving
 

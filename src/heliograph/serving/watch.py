@@ -11,14 +11,15 @@ from pydantic_core import from_json
 
 from heliograph.fusion.rules import Fusion
 from heliograph.live.event import VERDICTS
-from heliograph.live.lanes import TIME_STEP
 from heliograph.model.estimate import Claim
-from heliograph.numerics.types import unit_of
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, output_row
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.running_nis import MEMORY, RunningNis
+from heliograph.simulation.description.diagram import listed
 from heliograph.simulation.network import FUSED, Network
 
 T = TypeVar("T")
@@ -26,6 +27,7 @@ PLANTS = 200  # plants with estimates in memory, those with the newest messages
 POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
+APART = 3  # nodes that have a warning each; more of the same kind have one together
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
 
 
@@ -262,8 +264,14 @@ class Watch:
             if sender["dead"]:
                 chance = f"by chance once in {1 / sender['chance']:,.0f}" if sender["chance"] else "never by chance"
                 yield f"{node}: its sender is dead: {sender['missed']} heartbeats did not come, {chance}"
-        for node, link in _added(plants).items():
-            yield from (f"{node}: {link[name]} {words}" for name, words in COUNTED.items() if link[name])
+        links = _added(plants)
+        for name, words in COUNTED.items():
+            of = sorted(node for node in links if links[node][name])
+            # A line for each node, or one for many.
+            yield from (
+                f"{listed(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
+                for nodes in ([of] if len(of) > APART else [[node] for node in of])
+            )
 
 
 class Watched:
@@ -344,4 +352,5 @@ def watch_of(network: Network, title: str) -> Watch:
     }
     all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
     names |= {(FUSED, name): all_names for name in network.fused}
-    return Watch(network.states, title, "s" if TIME_STEP in network.inputs else "steps", fused, names)
+    unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
+    return Watch(network.states, title, unit, fused, names)

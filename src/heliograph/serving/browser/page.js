@@ -201,6 +201,8 @@ function searched(view) {
   return some;
 }
 
+const two = (value) => value !== 0 && (Math.abs(value) < 0.1 || Math.abs(value) > 99) ? short(value, 2) : value.toFixed(2);
+
 function status_of(sender) {
   if (!sender) return made("td", "");
   if (sender.dead) return made("td", "dead: " + sender.missed + " heartbeats missed", "doubt");
@@ -226,14 +228,14 @@ function tests(view) {
   const rows = view.tests.filter((test) => some.has(test.node)).sort((a, b) => some.get(a.node) - some.get(b.node) || a.filter.localeCompare(b.filter));
   at("tests").replaceChildren(...rows.map((test) => row(test.node + "/" + test.filter, [test.claim, ...(test.by.length
     ? [made("td", test.doubt ? "doubtful" : "holds", test.doubt ? "doubt" : "fine"), "by " + listed(test.by)]
-    : [made("td", test.ratio < 0.1 || test.ratio > 99 ? short(test.ratio, 2) : test.ratio.toFixed(2), test.doubt ? "doubt" : "fine"), short(test.low, 2) + " to " + short(test.high, 3)])])));
+    : [made("td", two(test.ratio), test.doubt ? "doubt" : "fine"), two(test.low) + " to " + two(test.high)])])));
 }
 
 function outputs(view) {
   at("weighed").hidden = !view.outputs.length;
-  const two = (value) => value === null ? "" : value.toFixed(2);
+  const number = (value) => value === null ? "" : value.toFixed(2);
   at("outputs").replaceChildren(...view.outputs.map((one) => row(one.output, [one.node + "/" + one.filter,
-    made("td", one.words, one.to_blame ? "doubt" : "fine"), two(one.weight), two(one.squared)])));
+    made("td", one.words, one.to_blame ? "doubt" : "fine"), number(one.weight), number(one.squared)])));
 }
 
 const listed = (names) => names.slice(0, 3).join(", ") + (names.length > 3 ? " and " + (names.length - 3) + " more" : "");
