@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.report.health import Link, examine
-from heliograph.report.innovations import rounded
-from heliograph.report.outputs import errors_of
+from heliograph.report.health import FilterHealth, Link, examine
+from heliograph.report.outputs import errors_of, rounded
 from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
+from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Losing
 
 STEPS = 300
@@ -196,6 +197,23 @@ def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
     fits(page)
     assert "The recording agrees with the network" in page and "there to be compared with" in page
     assert "None is missing" in page and "orange" not in page
+
+
+def test_many_filters_do_not_make_a_doubt_of_chance(health):
+    """Twenty tests at a level of 1 % each made a doubt in half of all recordings of twenty nodes that were right."""
+
+    def judged(power: float, p_value: float, count: int) -> list[str]:
+        test = MemoryTest(np.zeros(1), np.full(1, 0.1), p_value, 0.0, power, 0.1 * power)
+        quiet = replace(test, power=1.0, p_value=0.5)
+        of = [FilterHealth("a", f"f{i}", "exact", None, quiet if i else test) for i in range(count)]
+        return replace(health, filters=of, links=[]).warnings()
+
+    # Normal quantiles of 1 % and 1 % / 20, both sides: 2.58 and 3.48 relative errors of 0.1.
+    for count, errors in ((1, 2.58), (20, 3.48)):
+        for sign in (-1, 1):
+            assert judged(np.exp(sign * 0.1 * (errors - 0.02)), 0.5, count) == []
+            assert len(judged(np.exp(sign * 0.1 * (errors + 0.02)), 0.5, count)) == 1
+    assert len(judged(1.0, 0.009, 1)) == 1 and judged(1.0, 0.009, 20) == []
 
 
 def test_a_doubt_names_its_filter(health):

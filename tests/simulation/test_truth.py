@@ -6,6 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.cli.run import run as command
 from heliograph.report.health import examine
+from heliograph.report.outputs import errors_of, rounded
 from heliograph.report.run_page import errors_table, run_summary
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
@@ -88,7 +89,12 @@ def test_the_report_shows_the_errors():
     assert table.headers == ["filter", "claim", "RMSE of place", "RMSE of speed", "NEES"]
     rmse = record.rmse("a", "f")
     size = record.nees("a", "f").mean() / 2
-    assert table.rows == [["a/f", "exact", f"{rmse['place']:.4g}", f"{rmse['speed']:.4g}", f"{size:.3g}"]]
+    assert table.rows[0][:2] == ["a/f", "exact"] and table.rows[0][4] == f"{size:.3g}"
+    # The standard error of a mean square over twice the root, by numbers that are far enough apart to be independent.
+    (of,) = errors_of(record)
+    assert of.rmse == rmse
+    for shown, (state, error) in zip(table.rows[0][2:4], of.rmse_error.items(), strict=True):
+        assert shown == rounded(rmse[state], error) and 0.05 < error / rmse[state] < 0.3  # 1/sqrt(2 n), n = 40 or fewer
     errors = run_summary(health)["errors"]["a"]["f"]
     assert errors == {"rmse": rmse, "nees": pytest.approx(size)}
     assert errors_table(hg.run(NETWORK, single.measurements)) == []
@@ -102,5 +108,7 @@ def test_the_command_says_how_far_off(tmp_path, capsys):
     command(f"{tmp_path}/net.py", measurements=tmp_path / "data.csv", out=tmp_path / "out.csv")
     record = hg.run(NETWORK, *recording)
     rmse = record.rmse("a", "f")
-    line = f"a/f: RMSE of place {rmse['place']:.4g}, of speed {rmse['speed']:.4g}; NEES per state "
+    (of,) = errors_of(record)
+    place, speed = (rounded(value, of.rmse_error[state]) for state, value in rmse.items())
+    line = f"a/f: RMSE of place {place}, of speed {speed}; NEES per state "
     assert line in capsys.readouterr().out

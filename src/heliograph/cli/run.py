@@ -178,11 +178,13 @@ def _written(record: "Record", out: Path | None, report: Path | None) -> list[st
 
 def _errors(record: "Record") -> list[str]:
     """Compare each filter with the truth, a line each: RMSE by state, and NEES, which is 1 where the claim holds."""
-    from heliograph.report.outputs import errors_of
+    from heliograph.report.outputs import errors_of, rounded
 
     lines = []
     for errors in errors_of(record):
-        rmse = ", ".join(f"of {state} {value:.4g}" for state, value in errors.rmse.items())
+        rmse = ", ".join(
+            f"of {state} {rounded(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()
+        )
         size = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {rmse}{size}")
     return lines

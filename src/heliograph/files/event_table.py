@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from heliograph.files.recording import TIME_STEP, Recording
+from heliograph.files.recording import Recording
 from heliograph.files.sources import Reading
 from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import INPUTS, Event
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float, Int

@@ -9,10 +9,11 @@ import numpy as np
 
 from heliograph.disk.whole_file import FORMATS
 from heliograph.files.event_table import SECOND, EventTable
-from heliograph.files.recording import TIME_STEP, write_estimates
+from heliograph.files.recording import write_estimates
 from heliograph.files.sources import Reading
 from heliograph.live.event import INPUTS, Event, whole
 from heliograph.live.recorded import play
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, looks_like_date
 from heliograph.simulation.network import Network

@@ -10,14 +10,13 @@ import numpy as np
 
 from heliograph.files.table import TIME, columns_of, write_table
 from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import with_unit
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
-
-TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 
 
 @readable

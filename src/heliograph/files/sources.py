@@ -13,8 +13,8 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from heliograph.files.recording import TIME_STEP
 from heliograph.live.event import INPUTS, whole
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import TINY, fail, scalar, shown, text
 from heliograph.numerics.dates import UNITS, dates, instant
 from heliograph.numerics.module import readable

@@ -12,7 +12,7 @@ from heliograph.live.row_step import RowStep
 from heliograph.live.snapshot import Identity, network_identity
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered
-from heliograph.model.plant import AbstractPlant
+from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
@@ -21,7 +21,6 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.stepping import AllFilters, begun
 
-TIME_STEP = "dt"  # the input that a plant of continuous time has
 CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, in the plant's own unit
 TOLERANCE = 1e-9  # relative: a few products lose 1e-15
 

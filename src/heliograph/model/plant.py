@@ -25,6 +25,7 @@ from heliograph.random_affine.noise import (
     as_noise,
 )
 
+TIME_STEP = "dt"  # input that is the time since the row before, in the unit of the times
 MatrixFunction = TypeAliasType("MatrixFunction", Callable[[jax.Array], ArrayLike])  # a matrix of the input u
 
 

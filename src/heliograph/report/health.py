@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri
 
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
 from heliograph.simulation.network import Network
@@ -11,7 +12,7 @@ from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
-SURE = 2.58  # standard errors: one warning in a hundred is a false one
+FALSE = 0.01  # probability of a false warning by one kind of test, of all filters together
 
 
 @dataclass(frozen=True)
@@ -73,34 +74,37 @@ class Health:
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
         for doubted in self.doubted():
-            lines += _doubts(doubted)
+            lines += self._doubts(doubted)
         return lines
 
     def doubted(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts."""
-        return [filter for filter in self.filters if filter.trusted and any(_doubts(filter))]
+        return [filter for filter in self.filters if filter.trusted and any(self._doubts(filter))]
 
     def remarks(self) -> list[str]:
         """Return one line for each doubt about a filter that is there to be compared with."""
-        return [line for filter in self.filters if not filter.trusted for line in _doubts(filter)]
+        return [line for filter in self.filters if not filter.trusted for line in self._doubts(filter)]
 
-
-def _doubts(health: FilterHealth) -> Iterator[str]:
-    if health.test is None:
-        return
-    name, test = f"{health.node}/{health.filter}", health.test
-    if test.power > 1 + SURE * test.power_error:
-        yield (
-            f"{name} is too sure: the mean square of its innovations is {test.power:.2f} times what it claims; "
-            "the model leaves something out"
-        )
-    elif test.power < 1 - SURE * test.power_error:
-        yield f"{name} is too cautious: the mean square of its innovations is {test.power:.2f} times what it claims"
-    if test.significant:
-        yield (
-            f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "
-            "links or the plant remember what the model forgets"
-        )
+    def _doubts(self, health: FilterHealth) -> Iterator[str]:
+        if health.test is None:
+            return
+        name, test = f"{health.node}/{health.filter}", health.test
+        # Many filters are tested: each at a level at which all together are seldom wrong (Bonferroni). The logarithm
+        # of a mean square is nearly Gaussian, with its relative error; one that came out small has a small error too.
+        level = FALSE / sum(filter.test is not None for filter in self.filters)
+        sure = -ndtri(level / 2) * test.power_error / test.power
+        if np.log(test.power) > sure:
+            yield (
+                f"{name} is too sure: the mean square of its innovations is {test.power:.2f} times what it claims; "
+                "the model leaves something out"
+            )
+        elif np.log(test.power) < -sure:
+            yield f"{name} is too cautious: the mean square of its innovations is {test.power:.2f} times what it claims"
+        if test.p_value < level:
+            yield (
+                f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "
+                "links or the plant remember what the model forgets"
+            )
 
 
 def examine(

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
 from heliograph.report.health import FilterHealth, Health
+from heliograph.report.outputs import rounded
 from heliograph.report.page import Choice, Picture, Section, Table, Text
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
@@ -122,12 +123,13 @@ def _outputs_table(health: Health) -> list[Table]:
     """Return what the innovations of each output say of it; of filters that weigh, how many values they doubted."""
     rows = []
     for output in health.outputs:
-        # Numbers of the summary; the bias to the digits that its interval holds.
+        # Numbers of the summary; the bias to two digits of its standard error.
         s = output.summary
         doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
+        error = half / 1.96
         name = visible(f"{output.node}/{output.filter}: {output.output}")
-        bias = f"{rounded(s.bias, half / 1.96)} ± {half:.1g}"
+        bias = f"{rounded(s.bias, error)} ± {rounded(half, error)}"
         rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
                      "to blame" if output.to_blame else ""])  # fmt: skip
     caption = (
@@ -137,14 +139,6 @@ def _outputs_table(health: Health) -> list[Table]:
         "lies above that of the filter's other outputs together, by an interval of the difference."
     )
     return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
-
-
-def rounded(value: float, error: float) -> str:
-    """Return a number to two digits of its standard error; to four of its own without one."""
-    if not (np.isfinite(value) and 0 < error < np.inf):
-        return f"{value:.4g}"
-    places = 1 - int(np.floor(np.log10(error)))
-    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
 def chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:

@@ -16,10 +16,13 @@ from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.whiteness import correlated_mean
 
 
 class Errors(NamedTuple):
     """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
+
+    `rmse_error` is the standard error of each RMSE, of errors that are correlated in time.
 
     `claim` is what holds in all rows; `nees` is NaN where nothing is claimed.
     """
@@ -28,6 +31,7 @@ class Errors(NamedTuple):
     filter: str
     claim: str
     rmse: dict[str, float]
+    rmse_error: dict[str, float]
     nees: float
 
 
@@ -43,8 +47,25 @@ def errors_of(record: Record) -> list[Errors]:
             judged = ~np.isnan(values)
             size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
             claim = weakest(np.unique(estimate.claims).tolist())
-            results.append(Errors(node, name, claim, record.rmse(node, name), size))
+            rmse = record.rmse(node, name)
+            results.append(Errors(node, name, claim, rmse, _rmse_errors(record, node, name, rmse), size))
     return results
+
+
+def _rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
+    """Return the standard error of each RMSE, that of the mean square over twice the RMSE; NaN where there is none."""
+    truth = np.asarray(record.truth)
+    squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
+    means = [correlated_mean(column)[1] for column in squares.T]
+    return {state: e / (2 * rmse[state]) if rmse[state] > 0 else np.nan for state, e in zip(rmse, means, strict=True)}
+
+
+def rounded(value: float, error: float) -> str:
+    """Return a number to two digits of its standard error; to four of its own without one."""
+    if not (np.isfinite(value) and 0 < error < np.inf):
+        return f"{value:.4g}"
+    places = 1 - int(np.floor(np.log10(error)))
+    return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
 class OutputHealth(NamedTuple):

@@ -19,11 +19,10 @@ from heliograph.report.innovations import (
     innovations_figure,
     innovations_section,
     not_drawn,
-    rounded,
     tested_by_figure,
     time_axis,
 )
-from heliograph.report.outputs import errors_of, output_numbers
+from heliograph.report.outputs import errors_of, output_numbers, rounded
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED
@@ -142,14 +141,15 @@ def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | C
 def errors_table(record: Record) -> list[Table]:
     """Return the errors of each filter where the recording has the true state."""
     rows = [
-        [visible(f"{errors.node}/{errors.filter}"), errors.claim, *(f"{value:.4g}" for value in errors.rmse.values()),
+        [visible(f"{errors.node}/{errors.filter}"), errors.claim,
+         *(rounded(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
          "–" if np.isnan(errors.nees) else f"{errors.nees:.3g}"]
         for errors in errors_of(record)
     ]  # fmt: skip
     # What the columns are, in words.
     caption = (
-        "Root mean square error of each state against the truth in the recording. **NEES**: squared error over the "
-        "claimed one, per state: 1 where the claim holds, above 1 too sure."
+        "Root mean square error of each state against the truth in the recording, to two digits of its standard "
+        "error. **NEES**: squared error over the claimed one, per state: 1 where the claim holds, above 1 too sure."
     )
     headers = [
         "filter",

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,10 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.codegen.engine import computed
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_times, fail, instance, table
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
-from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
@@ -104,6 +106,8 @@ def run(
         }
         outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
     record = record_of(network, smoothing, outputs, clock)
+    if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
+        record = replace(record, units=record.units | {"time": unit})
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.events import holds_events, read_events
-from heliograph.files.recording import TIME_STEP, read_recording
+from heliograph.files.recording import read_recording
 from heliograph.files.table import columns_of
 from heliograph.live.event import INPUTS, Event
+from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar
 from heliograph.simulation.network import Network
 

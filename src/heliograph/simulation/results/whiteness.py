@@ -86,8 +86,8 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     if not np.any(np.nan_to_num(white)):
         raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
     # Correlations and their standard errors by lag.
-    size, size_error = _mean(_by_step(white**2))
-    parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+    size, size_error = correlated_mean(_by_step(white**2))
+    parts = [correlated_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
     # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
     p_value = float(2 * ndtr(-abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
@@ -135,8 +135,8 @@ def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]
     return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
 
 
-def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Mean of the values that are not NaN, and its standard error by Bartlett's weights.
+def correlated_mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Mean of the values that are not NaN, and its standard error by Bartlett's weights, of values correlated in time.
 
     The weights reach over the cube root of the length.
     """
