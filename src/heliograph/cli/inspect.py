@@ -21,7 +21,7 @@ def inspect(
     Parameters
     ----------
     recording:
-        A bag (.mcap, .db3, .bag, or a folder), or the URL of a broker, mqtt:// or nats://.
+        A bag (.mcap, .db3, .bag, or a folder), or the URL of a broker: mqtt://, nats:// or opc.tcp://.
     """
     import rich.console
     import rich.markup

@@ -9,6 +9,7 @@ pytest.importorskip("asyncua")
 from asyncua import Server, ua
 
 import heliograph as hg
+from heliograph.files.inspection import Topic, suggestion
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import InputError
@@ -163,9 +164,32 @@ def test_a_change_is_a_step_of_a_node_whose_sender_has_the_deadband():
     asyncio.run(work())
 
 
-def test_a_server_cannot_be_listened_to():
-    with pytest.raises(InputError, match=r"opc\.tcp://plc:4840/: expected mqtt:// or nats://, whose topics can be lis"):
-        listen(address("opc.tcp://plc", {}), 1.0)
+@pytest.mark.real("OPC UA")
+def test_inspect_lists_the_variables_of_a_server_and_suggests_sources():
+    """Two changes a second while it listens, all beyond the deadband; properties are no topics."""
+
+    async def changed(server: Server) -> None:
+        for value in range(21, 200):
+            await asyncio.sleep(0.5)
+            await server.get_node(VARIABLE).write_value(float(value))
+
+    async def work() -> dict[str, Topic]:
+        port = free_port()
+        server = await served(port)
+        changes = asyncio.create_task(changed(server))
+        try:
+            return await asyncio.to_thread(listen, address(f"opc.tcp://127.0.0.1:{port}/plant", {}), 4.0)
+        finally:
+            changes.cancel()
+            await server.stop()
+
+    topics = asyncio.run(work())
+    assert list(topics) == [VARIABLE] and topics[VARIABLE].kind == "Double, deadband 0.5, 0.1 s"
+    count, rate, _, late = topics[VARIABLE].row()[1:]
+    assert int(count) >= 4 and 1.0 < float(rate.removesuffix(" Hz")) < 3.0  # two a second, on a busy machine
+    assert 0 <= float(late.split()[0]) < 1.0
+    line = f"    {VARIABLE!r}: hg.files.json_field('value', node='NODE', output='OUTPUT', time='source_time'),"
+    assert suggestion(topics, {}).splitlines() == ["sources = {", line, "}"]
 
 
 @pytest.mark.real("OPC UA")

@@ -22,10 +22,12 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
     Raises:
         ValueError: no connection; one line that names the broker.
     """
-    if address.kind == "opc.tcp":
-        raise fail(f"{address}", "mqtt:// or nats://, whose topics can be listened to", address.kind)
     topics: dict[str, Topic] = {}
-    if address.kind == "mqtt":
+    if address.kind == "opc.tcp":
+        from heliograph.serving.brokers.opcua import Listener
+
+        asyncio.run(Listener(topics).listen(address, seconds))
+    elif address.kind == "mqtt":
         _listen_mqtt(address, seconds, topics)
     else:
         asyncio.run(_listen_nats(address, seconds, topics))

@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import json
+import logging
+import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
@@ -11,6 +13,7 @@ from asyncua import Client, Node, ua
 from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
+from heliograph.files.inspection import Topic, note
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, shown, text
 from heliograph.serving.brokers.pipe import Pipe
@@ -141,16 +144,9 @@ class OpcUa:
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
         """Translate a change; the first value of a subscription was there before, as a stored message."""
-        name, value = node.nodeid.to_string(), data.monitored_item.Value
-        good = value.StatusCode is None or value.StatusCode.is_good()
-        content = {
-            "value": val if good and isinstance(val, bool | int | float) else None if not good else shown(val),
-            "source_time": _iso(value.SourceTimestamp),
-            "server_time": _iso(value.ServerTimestamp),
-        }
+        name, body = _message(node, val, data)
         stored = name in self._first
         self._first.discard(name)
-        body = json.dumps(content).encode()
         self._came.put_nowait(self._translator.read(name, body, datetime.now(UTC), stored))
 
     async def _connected(self) -> None:
@@ -171,23 +167,98 @@ class OpcUa:
                 await self._retry.wait(error)
 
     async def _subscribe(self) -> None:
-        client = Client(str(self.address), timeout=WAIT)
-        if self.address.user is not None:
-            client.set_user(self.address.user)
-            client.set_password(self.address.password or "")
+        client = _client(self.address)
         await client.connect()
         self._client = client
-        # Each variable with the deadband and the interval that the server states.
         for name in self._translator.sources.topics:
             node = _node(client, name)
-            rule = self.reporting[name] = await reporting_of(node)
-            interval = 1e3 * (rule.interval or FASTEST)
             self._first.add(node.nodeid.to_string())
-            subscription = await client.create_subscription(interval, self)
-            if rule.deadband > 0:
-                await subscription.deadband_monitor(node, ua.Double(rule.deadband))
-            else:
-                await subscription.subscribe_data_change(node, sampling_interval=ua.Duration(interval))
+            self.reporting[name] = await _monitor(client, node, self)
+
+
+class Listener:
+    """Handler of changes that notes them as messages of topics; `kinds` names the type and the rule of each variable.
+
+    The first value of a variable was there before: it says nothing of rate and lateness.
+    """
+
+    def __init__(self, topics: dict[str, Topic]):
+        self.topics, self.kinds = topics, dict[str, str]()
+
+    async def listen(self, where: Address, seconds: float) -> None:
+        """Subscribe for a while to all variables below Objects but those of the server itself.
+
+        Raises:
+            ValueError: no server there; one line.
+        """
+        try:
+            async with _client(where) as client:
+                for node in await _variables(client):
+                    self.kinds[node.nodeid.to_string()] = (await node.read_data_type_as_variant_type()).name
+                    rule = await _monitor(client, node, self)
+                    if rule.deadband > 0:
+                        self.kinds[node.nodeid.to_string()] += f", deadband {rule.deadband:g}, {rule.interval:g} s"
+                await asyncio.sleep(seconds)
+        except AWAY as error:
+            raise fail(f"OPC UA server {where}", "an answer", f"{type(error).__name__} {error}".strip()) from None
+        for name, topic in self.topics.items():
+            topic.kind = self.kinds[name]
+
+    def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
+        """Note a change."""
+        name, body = _message(node, val, data)
+        stored = name not in self.topics
+        note(self.topics, name, body, time.time_ns())
+        if stored:
+            del self.topics[name].logged[:], self.topics[name].late[:]
+
+
+def _client(where: Address) -> Client:
+    logging.getLogger("asyncua").setLevel(logging.ERROR)  # it warns of what a server grants less of than it asks for
+    client = Client(str(where), timeout=WAIT)
+    if where.user is not None:
+        client.set_user(where.user)
+        client.set_password(where.password or "")
+    return client
+
+
+async def _monitor(client: Client, node: Node, handler: OpcUa | Listener) -> Reporting:
+    """Subscribe to a variable with the deadband and the interval that the server states."""
+    rule = await reporting_of(node)
+    interval = 1e3 * (rule.interval or FASTEST)
+    subscription = await client.create_subscription(interval, handler)
+    if rule.deadband > 0:
+        await subscription.deadband_monitor(node, ua.Double(rule.deadband))
+    else:
+        await subscription.subscribe_data_change(node, sampling_interval=ua.Duration(interval))
+    return rule
+
+
+async def _variables(client: Client) -> list[Node]:
+    """Return the variables below Objects that are of no namespace of OPC UA itself, MOST at most."""
+    found, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
+    while waiting and len(found) < MOST:
+        for child in await waiting.pop(0).get_children_descriptions():
+            known = child.NodeId.NamespaceIndex == 0 or child.NodeId in seen
+            if known or child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty:
+                continue
+            seen.add(child.NodeId)
+            waiting.append(client.get_node(child.NodeId))
+            if child.NodeClass == ua.NodeClass.Variable:
+                found.append(waiting[-1])
+    return found
+
+
+def _message(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
+    """Return the topic of a change and its message; null is a value of bad quality."""
+    sample = data.monitored_item.Value
+    good = sample.StatusCode is None or sample.StatusCode.is_good()
+    content = {
+        "value": value if good and isinstance(value, bool | int | float) else None if not good else shown(value),
+        "source_time": _iso(sample.SourceTimestamp),
+        "server_time": _iso(sample.ServerTimestamp),
+    }
+    return node.nodeid.to_string(), json.dumps(content).encode()
 
 
 def _node(client: Client, name: str) -> Node:
@@ -212,7 +283,7 @@ async def _property(node: Node, name: str) -> object:
     return None
 
 
-def _iso(time: datetime | None) -> str | None:
-    if time is None:
+def _iso(moment: datetime | None) -> str | None:
+    if moment is None:
         return None
-    return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).isoformat()
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).isoformat()
