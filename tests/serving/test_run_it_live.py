@@ -105,7 +105,9 @@ def test_the_state_is_stored_next_to_the_network_by_default(tmp_path, monkeypatc
     assert (count, refused, said) == (20, set(), "")
     assert cli.main(["serve", "net.py"]) == 2  # of another window
     said = capfd.readouterr().err
-    assert "option window: 10.0" in said and said.endswith("; --accept-changes goes on with what fits\n")
+    assert "got one that differs: option window: 5.0 -> 10.0; to begin" in said and said.endswith(
+        "; --accept-changes goes on with what fits\n"
+    )
 
 
 def retuned(store, capfd):
@@ -118,7 +120,9 @@ def retuned(store, capfd):
     first = piped(f"{command} < first", capfd)
     Path("net.py").write_text(SMALL.replace("0.04", "0.09"))
     assert cli.main(shlex.split(command)[1:]) == 2
-    assert capfd.readouterr().err.endswith("; --accept-changes goes on with what fits\n")
+    said = capfd.readouterr().err
+    assert "differs: plant.noise.covariance: 0.04 -> 0.09" in said
+    assert said.endswith("; --accept-changes goes on with what fits\n")
     second = piped(f"{command} --accept-changes < rest", capfd)
     assert "plant.noise.covariance: 0.04 -> 0.09\n" in SAID.read_text()
     assert "numbers of" not in SAID.read_text() and "begins with the initial law" not in SAID.read_text()

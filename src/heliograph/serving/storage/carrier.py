@@ -217,12 +217,16 @@ def changes(mine: Identity, other: Identity) -> list[str]:
         and name not in (DESCRIPTION, "what is computed", "layout of the store")
     ]
     # Numbers of the parts that are in both; of long arrays only a hash is known, and of functions the program.
-    here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
+    try:
+        here, there = (json.loads(identity[DESCRIPTION])["values"] for identity in (mine, other))
+    except KeyError:  # an identity without its numbers
+        return lines
     for name in here:
         if name in there:
             lines += [
                 f"{name}{path}: {line}"
                 for path in {**there[name], **here[name]}
+                if not path.endswith(".factor")  # of a covariance, which is there too
                 for line in _changed(there[name].get(path), here[name].get(path))
             ]
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
@@ -241,7 +245,7 @@ def _changed(before: object, after: object) -> list[str]:
     except (TypeError, ValueError):
         return [f"{before} -> {after}"]
     if a.shape != b.shape or before is None or after is None:
-        return [f"{before} -> {after}"]
+        return [" -> ".join("none" if side is None else f"{side}" for side in (before, after))]
     places = [tuple(map(int, index)) for index in np.argwhere(a != b)]
     lines = [f"{list(index) if a.size > 1 else ''} {a[index]:.6g} -> {b[index]:.6g}".strip() for index in places]
     return lines[:LISTED] + ([f"and {len(lines) - LISTED} more of its numbers"] if len(lines) > LISTED else [])

@@ -28,7 +28,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliograph.live.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
-from heliograph.serving.storage.carrier import DESCRIPTION, Carrier
+from heliograph.serving.storage.carrier import DESCRIPTION, LISTED, Carrier, changes
 from heliograph.serving.storage.database import engine_at
 from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
 
@@ -116,7 +116,7 @@ class Store:
                 self._check_layout()
                 # The network must be the same, unless its plants are carried over or any will do.
                 if carrier is None and mine is not None:
-                    check_same(f"store {self.name}", _compared(mine), _compared(self.identity))
+                    self._check_network(mine)
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
                 if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
                     self.carry(carrier, f"store {self.name}", self.identity)
@@ -125,6 +125,15 @@ class Store:
             fits = carrier is None and self.identity.get(LAYOUT_KEY) == LAYOUT
             more = "; --accept-changes goes on with what fits" if fits else ""
             raise InputError(f"{error}; to begin anew, name another{more}") from None
+
+    def _check_network(self, mine: Identity) -> None:
+        """Refuse the state of another network, naming what differs."""
+        differs = changes(mine, self.identity)
+        if differs and _compared(mine) != _compared(self.identity):
+            more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
+            got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
+            raise fail(f"store {self.name}", "the state of what is here", got)
+        check_same(f"store {self.name}", _compared(mine), _compared(self.identity))
 
     @contextmanager
     def _saying(self, expected: str) -> Iterator[None]:
