@@ -78,7 +78,8 @@ def index() -> str:
 Every public name, at the one place it is imported from. What the first hour needs stands in ``heliograph`` itself
 (``import heliograph as hg``); everything else is reached through its room, as ``hg.filters.imm_filter``. What keeps
 filters running needs the extra ``live`` and is imported, as ``from heliograph.serving import Service``. A list of all
-names on one page: :doc:`/names`. Words and letters: :doc:`/notation`.
+names on one page: :doc:`/names`. Words and letters: :doc:`/notation`. Names, and words of other packages, in one
+alphabet: :ref:`genindex`.
 
 .. list-table::
    :header-rows: 1
@@ -227,9 +228,23 @@ def link_names(app, doctree, page):
 
 def connect(app: object) -> None:
     """Let autodoc use these signatures and docstrings, and pages link to them."""
+    app.connect("doctree-read", index_words)
     app.connect("doctree-resolved", link_names)
     app.connect("autodoc-process-signature", _on_signature)
     app.connect("autodoc-process-docstring", _on_docstring)
+
+
+def index_words(app, doctree):
+    """Put each word of the first page's table of words into the site's index, at its row."""
+    if app.env.docname != "index":
+        return
+    words = next(section for section in doctree.findall(nodes.section) if "words" in section["ids"])
+    for number, row in enumerate(next(words.findall(nodes.tbody)).children):
+        cell = row.children[0]
+        anchor = f"words-{number}"
+        cell.insert(0, nodes.target("", "", ids=[anchor]))
+        entries = [("single", word, anchor, "", None) for word in cell.astext().strip().split(", ")]
+        app.env.get_domain("index").entries["index"] += entries
 
 
 def _on_signature(app, what, name, item, options, arguments, result):

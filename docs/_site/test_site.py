@@ -5,6 +5,7 @@ HELIOGRAPH_PICTURES=FOLDER keeps each page as a picture at both widths.
 
 import inspect
 import os
+import re
 from collections.abc import Iterator
 from functools import cache
 from html.parser import HTMLParser
@@ -117,3 +118,10 @@ def test_the_search_leads_from_a_word_of_other_packages_to_a_page_that_has_it(br
     pages = "[...document.querySelectorAll('#search-results li a')].map(a => a.getAttribute('href')).join(' ')"
     addresses = browser.call("Runtime.evaluate", expression=pages)["result"]["value"]
     assert "coming_from.html" in addresses or "irregular.html" in addresses
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_the_index_has_a_word_of_other_packages(word):
+    leads = re.findall(r'<a href="(index\.html#words-\d+)">([^<]*)</a>', (SITE / "genindex.html").read_text())
+    targets = {address for address, text in leads if word in re.split(r"\W+", text) or word == text.split()[0]}
+    assert targets and all(urldefrag(address).fragment in links("index.html").places for address in targets)
