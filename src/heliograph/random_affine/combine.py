@@ -1,7 +1,6 @@
 """Maps made of maps: the atom, one random gain times a matrix plus noise; in series, mixed and stacked."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import reduce
 from itertools import product
 
@@ -167,20 +166,6 @@ class AbstractOfMaps(AbstractOfParts):
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
 
-    @property
-    def parts(self) -> tuple[AbstractRandomAffine, ...]:
-        """The maps."""
-        return self.maps
-
-    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of others."""
-        return replace(self, maps=parts)
-
-    @property
-    def remembers(self) -> bool:
-        """True if one of the maps remembers."""
-        return any(m.remembers for m in self.maps)
-
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """The maps' states."""
         keys = jax.random.split(key, len(self.maps))
@@ -242,6 +227,11 @@ class Series(AbstractOfMaps):
             products = corners @ first[:, None]
             first = products.reshape(-1, *products.shape[2:])
         return first
+
+
+def opened(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """Return the maps of a channel in series, those of series within it too; itself alone where it is none."""
+    return [m for affine in channel.maps for m in opened(affine)] if isinstance(channel, Series) else [channel]
 
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:

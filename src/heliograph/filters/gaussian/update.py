@@ -21,7 +21,7 @@ from heliograph.filters.gaussian.correction import (
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Series
+from heliograph.random_affine.combine import GainAndNoise, opened
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
@@ -187,7 +187,7 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     `variance` is the bound on var g of a hop.
     """
-    hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
+    hops = [_hop_range(hop) for hop in opened(channel)]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:
