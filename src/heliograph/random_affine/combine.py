@@ -166,6 +166,11 @@ class AbstractOfMaps(AbstractOfParts):
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
 
+    @property
+    def inputs(self) -> int:
+        """Inputs of the first map."""
+        return self.maps[0].inputs
+
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """The maps' states."""
         keys = jax.random.split(key, len(self.maps))
@@ -199,11 +204,6 @@ class Series(AbstractOfMaps):
     def outputs(self) -> int:
         """Outputs of the last map."""
         return self.maps[-1].outputs
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of the first map."""
-        return self.maps[0].inputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and multiply."""
@@ -324,11 +324,6 @@ class Stack(AbstractOfMaps):
     def outputs(self) -> int:
         """Sum of the maps' outputs."""
         return sum(m.outputs for m in self.maps)
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of each map."""
-        return self.maps[0].inputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and stack the rows."""
