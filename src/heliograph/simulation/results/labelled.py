@@ -1,7 +1,7 @@
 """Labelled arrays and wide tables: the common parts of records and of statistics."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -114,7 +114,9 @@ def _of_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]
 
 TIME = "time"
 Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
-Part = tuple[tuple[int, ...], np.ndarray]  # where an array belongs, and the array
+T = TypeVar("T")
+Shape = tuple[int, ...]
+Placed = tuple[Shape, T]  # where a value belongs, and the value
 MEANING = {
     "truth": "true state",
     "measurement": "what reached the node, NaN where nothing arrived and beyond its length",
@@ -152,7 +154,15 @@ def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, 
     return {name: unit for name, unit in known.items() if unit}
 
 
-def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...], parts: Sequence[Part]) -> np.ndarray:
+def placed(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
+    """Names of all filters, and each filter's value with its place among nodes and filters."""
+    filters = list(dict.fromkeys(name for of in by_node.values() for name in of))
+    places: list[Placed[T]] = [((nodes.index(node), filters.index(name)), value)
+              for node, of in by_node.items() for name, value in of.items()]  # fmt: skip
+    return filters, places
+
+
+def filled(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
     """Arrays (*lead, *up to tail) at their places along axes between; NaN elsewhere."""
     arrays = np.full((*lead, *places, *tail), np.nan)
     ahead: tuple[slice, ...] = (slice(None),) * len(lead)
@@ -162,7 +172,7 @@ def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...]
     return arrays
 
 
-def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
+def claims_of(sizes: Shape, outcome: Iterable[Placed[Any]]) -> np.ndarray:
     """Claim of each filter, at its place; empty elsewhere."""
     claims = np.full(sizes, "", dtype="U7")
     for position, estimate in outcome:
