@@ -31,7 +31,7 @@ from heliograph.simulation.runs.lanes import (
     is_shared,
     one_processor,
 )
-from heliograph.simulation.runs.native_runs import natively
+from heliograph.simulation.runs.native import natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finished, reduced_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
