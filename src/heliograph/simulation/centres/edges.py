@@ -14,8 +14,8 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance, of_each
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree
+from heliograph.numerics.traced import library, plain
+from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, held_maps
 from heliograph.random_affine.delay import Delayed, sent
 from heliograph.random_affine.erasure import Erasure, arrived
@@ -159,11 +159,11 @@ def late_part(channel: AbstractRandomAffine) -> Delayed | None:
     return inside if isinstance(inside, Delayed) else None
 
 
-def _opened(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[float, AbstractRandomAffine]:
+def _opened(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
     """Return the link for messages that are not lost, inside all maps of these kinds, and how probable they are."""
-    arrival = 1.0
+    arrival: Scalar = 1.0
     while isinstance(channel, kinds):
-        arrival *= float(channel.arrival) if isinstance(channel, Erasure) else 1.0
+        arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
         channel = held_maps(channel)[0]
     return arrival, channel
 
@@ -173,7 +173,7 @@ def arrival_chance(channel: Channel | None) -> float | None:
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
     chance, inside = _opened(channel)
-    return None if inside.erases else chance
+    return None if inside.erases else float(chance)
 
 
 def loss_rate(channel: Channel | None) -> float | None:
@@ -185,11 +185,11 @@ def loss_rate(channel: Channel | None) -> float | None:
         return 0.0 if channel is None else None
     arrival, inside = _opened(channel, Erasure | Delayed)
     if not isinstance(inside, Modes):
-        return None if inside.erases else 1 - arrival
+        return None if inside.erases else 1 - float(arrival)
     chances = [arrival_chance(mode) for mode in inside.maps]
     if inside.memory.name is not None or None in chances:
         return None
-    losses = 1 - arrival * np.array(chances, dtype=float)
+    losses = 1 - float(arrival) * np.array(chances, dtype=float)
     return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(inside.memory.transition))).max())
 
 
