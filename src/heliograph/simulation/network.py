@@ -119,12 +119,7 @@ class Network(Module):
         self.mesh_kinds = tuple(
             Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
-        # Sensors and channels of each group fit, then fusions.
-        for names in self.groups:
-            node = self.nodes[names[0]]
-            if isinstance(node, Node):
-                check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
-                received_angles(plant, node.sensor, node.channel)
+        self._check_links()
         self._check_fused()
         for name, mesh in self.meshes.items():
             check_mesh(name, mesh, self)
@@ -141,6 +136,14 @@ class Network(Module):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+
+    def _check_links(self) -> None:
+        """Check that sensors and channels fit each other, one of each group."""
+        for names in self.groups:
+            node = self.nodes[names[0]]
+            if isinstance(node, Node):
+                check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
+                received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
         for name, fusion in self.fused.items():

@@ -95,9 +95,7 @@ def monte_carlo(
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
-    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
-        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
-    single = precision == "float32"
+    single = _is_single(precision)
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and not network.meshes and one_processor():
@@ -113,6 +111,12 @@ def monte_carlo(
         network = network.in_single_precision()
         smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
     return finished(reducer, recorded, network, smoothing)
+
+
+def _is_single(precision: Precision) -> bool:
+    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
+        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
+    return precision == "float32"
 
 
 class _Job(Module):

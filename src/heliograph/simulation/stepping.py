@@ -171,18 +171,20 @@ class AllFilters(Module):
             for name, test in self.tests.items()
         }
         tested = {name: following_prior(fused[name]) for name in self.tests}
-        # Next states, and what else is returned of each step.
-        if self.smooths:
-            outputs["smoother_steps"] = tuple(single.steps for _, single in stepped)
-            outputs["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
             outputs["tested"] = distances
-            outputs["judged"] = tuple(single.judgement for _, single in stepped)
-            outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
-            outputs["weighed"] = tuple(single.weighed for _, single in stepped)
-            outputs["weighed_centrally"] = {name: single.weighed for name, (_, single) in received.items()}
+        for field, of_nodes, centrally in self._details():
+            outputs[of_nodes] = tuple(getattr(single, field) for _, single in stepped)
+            outputs[centrally] = {name: getattr(single, field) for name, (_, single) in received.items()}
+        # Next states.
         central = {name: state for name, (state, _) in received.items()}
         return (tuple(state for state, _ in stepped), central, *following, tested), outputs
+
+    def _details(self) -> list[tuple[str, str, str]]:
+        """Further fields of each filter's step, with their names among the outputs: of nodes, of central filters."""
+        judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
+        steps = [("steps", "smoother_steps", "central_steps")]
+        return steps * self.smooths + judged * self.judges
 
     def _fused(
         self,
