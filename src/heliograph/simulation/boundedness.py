@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from heliograph.linear.known_losses import (
     BELOW_ONE,

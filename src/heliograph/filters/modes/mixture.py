@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import block_diag
+import scipy
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
@@ -90,7 +90,7 @@ def _after(x: Component, y: Component) -> Component:
 def _others(x: Component, y: Component) -> Component:
     """Stack both maps, one above the other."""
     gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
-    return Component(x.weight * y.weight, gain, offset, np.asarray(block_diag(x.noise, y.noise)))
+    return Component(x.weight * y.weight, gain, offset, np.asarray(scipy.linalg.block_diag(x.noise, y.noise)))
 
 
 def _gain_atoms(law: AbstractLaw) -> list[tuple[float, float]]:
@@ -107,7 +107,7 @@ NoiseAtom = tuple[float, np.ndarray, np.ndarray]  # probability, value, Gaussian
 
 
 def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
-    return a[0] * b[0], np.concatenate([a[1], b[1]]), np.asarray(block_diag(a[2], b[2]))
+    return a[0] * b[0], np.concatenate([a[1], b[1]]), np.asarray(scipy.linalg.block_diag(a[2], b[2]))
 
 
 def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
