@@ -18,8 +18,8 @@ STEPS, DIGITS = 60, 5e-4
 LINK = hg.erasure(hg.perfect(), 0.7)
 
 
-def leaf(one):
-    sensor = hg.LinearSensor(one["output"], one["noise"])
+def leaf(numbers):
+    sensor = hg.LinearSensor(numbers["output"], numbers["noise"])
     return hg.Node(sensor, hg.perfect(), {"own": hg.kalman_filter(PLANT, sensor)})
 
 
