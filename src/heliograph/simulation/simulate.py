@@ -39,6 +39,7 @@ from heliograph.smoothing.modes import AbstractSmoothing
 
 Progress = TypeAliasType("Progress", Callable[[int, int], None])
 Seed = TypeAliasType("Seed", int | jax.Array)  # or a JAX key
+Reducer = TypeAliasType("Reducer", AbstractReducer[Result], type_params=(Result,))
 Precision = TypeAliasType("Precision", Literal["float64", "float32"])
 
 
@@ -47,7 +48,7 @@ def monte_carlo(
     horizon: int,
     runs: int,
     key: Seed,
-    keep: "AbstractReducer[Result] | None" = None,
+    keep: "Reducer[Result] | None" = None,
     inputs: ArrayLike | None = None,
     chunk: int = 2048,
     progress: Progress | None = None,

@@ -27,22 +27,22 @@ def link_in_words(channel: Channel) -> str:
 
 def _words(channel: AbstractRandomAffine) -> str:
     """Return a map in words; nothing for one that only selects components."""
-    words: str = fold(channel, {
+    in_words: str = fold(channel, {
         # One case for each way of making a channel.
         GainAndNoise: lambda hop, _: _hop(hop),
         Series: lambda _, parts: ARROW.join(filter(None, parts)),
-        Stack: lambda _, parts: _stack([part or DIRECT for part in parts]),
+        Stack: lambda _, parts: _stack([words or DIRECT for words in parts]),
         Erasure: lambda loss, parts: f"{parts[0] or DIRECT}, {_percent(1 - loss.arrival)} lost",
-        Mixture: lambda mixture, parts: _mixture(mixture, [part or DIRECT for part in parts]),
+        Mixture: lambda mixture, parts: _mixture(mixture, [words or DIRECT for words in parts]),
         # Links that deliver late, and those whose modes remember.
         Delayed: lambda late, parts: f"{parts[0] or DIRECT}, {'/'.join(map(str, late.times))} steps late"
                                      f"{', timestamped' if late.timestamped else ''}",
         OfLine: lambda _, parts: parts[0],
-        Modes: lambda modes, parts: f"{_memory(modes)}modes ({' or '.join(part or DIRECT for part in parts)})",
+        Modes: lambda modes, parts: f"{_memory(modes)}modes ({' or '.join(words or DIRECT for words in parts)})",
         Faded: lambda faded, _: f"{_memory(faded)}drifting hop",
         AbstractRandomAffine: lambda other, _: type(other).__name__,
     })  # fmt: skip
-    return words
+    return in_words
 
 
 def _stack(parts: list[str]) -> str:
