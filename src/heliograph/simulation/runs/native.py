@@ -15,9 +15,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from heliograph.codegen.accumulated import Accumulated, Begun
-from heliograph.codegen.graph import Buffer, Type, Unsupported
 from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
 from heliograph.codegen.memory import LONG, InMemory
+from heliograph.codegen.nodes import Buffer, Type, Unsupported
 from heliograph.codegen.program import Program, Summed
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep
