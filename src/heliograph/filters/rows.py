@@ -21,7 +21,7 @@ class Steps(Protocol):
 
     @property
     def claim(self) -> Claim:
-        """What its covariances are."""
+        """Meaning of its covariances."""
 
     @property
     def inputs(self) -> tuple[str, ...]:

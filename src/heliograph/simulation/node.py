@@ -215,7 +215,7 @@ class HasNodes(Protocol):
 
     @property
     def plant(self) -> AnyPlant:
-        """What moves."""
+        """Plant of all nodes."""
 
     @property
     def nodes(self) -> dict[str, Node | ReceivingNode]:
