@@ -236,8 +236,8 @@ async def _monitor(client: Client, node: Node, handler: OpcUa | Listener) -> Rep
 
 async def _variables(client: Client) -> list[Node]:
     """Return the variables below Objects that are of no namespace of OPC UA itself, MOST at most."""
-    found, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
-    while waiting and len(found) < MOST:
+    variables, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
+    while waiting and len(variables) < MOST:
         for child in await waiting.pop(0).get_children_descriptions():
             known = child.NodeId.NamespaceIndex == 0 or child.NodeId in seen
             if known or child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty:
@@ -245,8 +245,8 @@ async def _variables(client: Client) -> list[Node]:
             seen.add(child.NodeId)
             waiting.append(client.get_node(child.NodeId))
             if child.NodeClass == ua.NodeClass.Variable:
-                found.append(waiting[-1])
-    return found
+                variables.append(waiting[-1])
+    return variables
 
 
 def _message(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
