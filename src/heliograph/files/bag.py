@@ -13,6 +13,7 @@ import numpy as np
 
 from heliograph.files.bag_layout import Decoder, RawMessage
 from heliograph.files.event_table import EventTable
+from heliograph.files.mcap_chunks import messages_of
 from heliograph.files.sources import Sources
 from heliograph.numerics.check import InputError, fail, shown_error
 from heliograph.simulation.network import Network
@@ -131,23 +132,24 @@ def raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator
         ValueError: damage, a topic that changes its type; one line with the place.
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
-    types, raw = dict[str, str](), reader.messages(connections) if connections else iter(())
+    types, raw = dict[str, str](), messages_of(reader, connections) if connections else iter(())
     count, last = 0, 0
     while True:
         try:
-            connection, logged, data = next(raw)
+            message = next(raw)
         except StopIteration:
             return
         except Exception as error:
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
             raise fail(f"{path}, {after}", "a bag without damage", _reason(error)) from None
         # Of the type that its topic had before.
+        connection, last = message.connection, message.logged
         kind = connection.msgtype
         if types.setdefault(connection.topic, kind) != kind:
-            where = f"{path}, {connection.topic}, logged at {moment(logged)}"
+            where = f"{path}, {connection.topic}, logged at {moment(last)}"
             raise fail(where, f"messages of {types[connection.topic]}, as before", kind)
-        yield RawMessage(connection, logged, bytes(data))
-        count, last = count + 1, logged
+        yield message
+        count += 1
 
 
 def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:

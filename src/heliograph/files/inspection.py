@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.bag import OFTEN, Progress, fields_of, opened
+from heliograph.files.mcap_chunks import messages_of
 from heliograph.files.sources import nanoseconds
 from heliograph.numerics.check import InputError, fail, shown_error
 from heliograph.numerics.dates import looks_like_date
@@ -67,7 +68,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         # When each message was logged, and how late by its stamp.
         total, done = reader.message_count, 0
         try:
-            for done, (connection, logged, data) in enumerate(reader.messages(), 1):
+            for done, (connection, logged, data) in enumerate(messages_of(reader, reader.connections), 1):
                 topic = topics[connection.topic]
                 topic.logged.append(logged)
                 if topic.time is not None and len(data) >= 12:
