@@ -143,6 +143,24 @@ def test_the_stochastic_trigger_without_hidden_losses_is_a_kalman_filter_with_an
         assert result.covariance[k, 0, 0] == pytest.approx(variance, rel=1e-12)
 
 
+def test_the_stochastic_trigger_claims_exactly_only_where_the_posterior_is_a_gaussian():
+    """What was sent says no more than its value if it arrives as it is, and silence leaves a Gaussian a Gaussian."""
+    skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+    trigger, exact = hg.StochasticTrigger(2.0, losses="known"), (PLANT, SENSOR, hg.erasure(hg.hop(-3.0, 0.0), 0.8))
+    assert hg.event_filter(*exact, trigger).claim == "exact"
+    others = [
+        (PLANT, SENSOR, hg.hop(1.0, 0.1)),
+        (PLANT, SENSOR, hg.hop(0.0, 0.0)),
+        (PLANT, hg.LinearSensor([[1.0]], hg.StudentT(0.1, 5.0)), hg.perfect()),
+        (hg.LinearPlant([[0.9]], skewed, [0.0], 1.0), SENSOR, hg.perfect()),
+        (hg.LinearPlant([[0.9]], 0.1, [0.0], skewed), SENSOR, hg.perfect()),
+    ]
+    assert [hg.event_filter(*models, trigger).claim for models in others] == ["nominal"] * 5
+    assert [hg.event_filter(*models, hg.Periodic(2)).claim for models in others] == ["exact"] * 5
+    pair, two = hg.LinearSensor([[1.0], [1.0]], np.eye(2)), hg.parallel([hg.erasure(hg.perfect(), 0.8)] * 2)
+    assert hg.event_filter(PLANT, pair, two, trigger).claim == "nominal"  # what is missing was sent too
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "trigger",
