@@ -141,7 +141,14 @@ def _loses(channel: SideInformation) -> bool:
 
 def _is_known(channel: SideInformation) -> bool:
     """True if no gain is random, and what arrives is all that was sent."""
-    return _alike(channel) and not np.any(np.asarray(channel.spread)[..., :-1, :-1])
+    return _alike(channel) and not np.any(_spread(channel)[..., :-1, :-1])
+
+
+def _spread(channel: SideInformation) -> np.ndarray:
+    """Spread of gain and noise, without what rounding leaves of a known gain behind losses."""
+    mean, spread = np.asarray(channel.mean), np.asarray(channel.spread)
+    size = np.abs(mean[..., :, None, :, None] * mean[..., None, :, None, :])
+    return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
 
 
 def _is_gaussian(*models: PyTree) -> bool:
@@ -156,7 +163,7 @@ def _reveals(channel: SideInformation) -> bool:
     for j, a in possible:
         gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
         size = np.abs(gain).max(axis=1, keepdims=True)
-        free = rows.all() and not np.any(np.asarray(channel.spread)[j, a])
+        free = rows.all() and not np.any(_spread(channel)[j, a])
         if not free or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < gain.shape[1]:
             return False
     return True
