@@ -223,3 +223,25 @@ def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, r
     e, variance = np.asarray(innovation.value)[:, 0], np.asarray(innovation.covariance)[:, 0, 0]
     assert np.trapezoid(density * e, z) / sent == pytest.approx(0, abs=1e-5)
     assert np.trapezoid(density * e**2 / variance, z) / sent == pytest.approx(1, abs=1e-5)
+
+
+NOISE_FREE = {
+    "tied states": (
+        hg.LinearPlant([[0.5, -0.8], [0.0, -0.8]], np.outer([0.38, 14.6], [0.38, 14.6]), [2e4, 8e4], np.zeros((2, 2))),
+        hg.LinearSensor([[-1.5e-3, 1e-3]], 0.0), hg.perfect(), hg.SendOnDelta(1.0),
+    ),
+    "each alone": (
+        hg.LinearPlant([[0.5, 0.4], [-0.1, -0.2]], [[0.053, 0.0166], [0.0166, 0.0052]], [0.0, 0.0], 1e-4 * np.eye(2)),
+        hg.LinearSensor([[2.5, 0.72], [6.4, 3.5]], np.zeros((2, 2))), hg.parallel([hg.erasure(hg.perfect(), 0.8)] * 2),
+        hg.SendOnDelta([0.035, 0.13], region="each"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOISE_FREE)
+def test_outputs_without_noise_leave_no_negative_variance(name):
+    plant, sensor, link, trigger = NOISE_FREE[name]
+    node = hg.Node(sensor, link, {"f": hg.event_filter(plant, sensor, link, trigger)}, trigger=trigger)
+    record = hg.monte_carlo(hg.Network(plant, {"a": node}), horizon=8, runs=16, key=1)
+    assert record.failures() == []
