@@ -22,7 +22,7 @@ help:  ## Show this list
 demo: .venv/.demo  ## Run the demonstration and write its report to out/
 	$(BIN)/heliograph demo --out out
 
-test: .venv/.test  ## Check style and types, run the tests that guard daily work (six minutes on two cores)
+test: .venv/.test  ## Check style and types, run the tests that guard daily work (five minutes on two cores)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy --strict src studies & types=$$!; \

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 import heliograph as hg
 from heliograph.model.estimate import STRENGTH, weakest
@@ -93,22 +94,32 @@ def test_optimal_is_best_and_no_worse_than_any_input(seed):
     assert trace["InverseCovarianceIntersection"] <= best_input * (1 + 1e-9)
 
 
-@pytest.mark.slow
-def test_inverse_covariance_intersection_is_the_oracles():
-    bounds = covariances(5, 2, 3, spread=0.3)
+@pytest.mark.parametrize("seed", [5, 6])
+def test_inverse_covariance_intersection_is_the_oracles(seed):
+    bounds = covariances(seed, 2, 3, spread=0.3)
     pair = estimates(bounds)
     fused = hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), pair)
 
-    def best_of(weights):
-        return min(weights, key=lambda w: np.trace(intersection(w)[1]))
+    def slope(w):
+        """Slope of the trace: -tr(V C (P - Q) C V)."""
+        common = np.linalg.inv(w * bounds[0] + (1 - w) * bounds[1])
+        _, covariance = oracle.inverse_intersection(pair[0].mean, bounds[0], pair[1].mean, bounds[1], w)
+        return -np.trace(covariance @ common @ (bounds[0] - bounds[1]) @ common @ covariance)
 
-    def intersection(w):
-        return oracle.inverse_intersection(pair[0].mean, bounds[0], pair[1].mean, bounds[1], w)
+    w = brentq(slope, 0, 1, xtol=1e-15)
+    mean, bound = oracle.inverse_intersection(pair[0].mean, bounds[0], pair[1].mean, bounds[1], w)
+    np.testing.assert_allclose(fused.covariance, bound, rtol=1e-12, atol=1e-13)  # rounding of inverses
+    np.testing.assert_allclose(fused.mean, mean, rtol=1e-11)  # the weight to rounding over the trace's curvature
 
-    coarse = best_of(np.linspace(0, 1, 201))
-    mean, bound = intersection(best_of(np.clip(coarse + np.linspace(-0.005, 0.005, 201), 0, 1)))
-    assert np.trace(fused.covariance) == pytest.approx(np.trace(bound), rel=1e-7)  # second order in the grid's step
-    np.testing.assert_allclose(fused.mean, mean, rtol=1e-3)
+
+def test_inverse_covariance_intersection_of_one_covariance_is_the_mean():
+    """Whatever the weight, the covariance is the same: rounding does not choose between the estimates."""
+    bound = covariances(5, 1, 3)[0]
+    for other in (bound, bound * (1 + 4e-16), bound * (1 - 4e-16)):
+        pair = estimates(np.stack([bound, other]))
+        fused = hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), pair)
+        np.testing.assert_allclose(fused.mean, (pair[0].mean + pair[1].mean) / 2, rtol=1e-12)
+        np.testing.assert_allclose(fused.covariance, bound, rtol=1e-12, atol=1e-13)
 
 
 def test_upper_bounds_stay_upper_for_any_correlation():

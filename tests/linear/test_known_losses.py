@@ -3,15 +3,8 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.known_losses import (
-    KnownLossSystem,
-    certified_radius,
-    find_gains,
-    lower_bound,
-    operator,
-    steady,
-)
-from heliograph.numerics.lapack import spectral_radius
+from heliograph.linear.jump_system import JumpSystem, mixed
+from heliograph.linear.known_losses import KnownLossSystem, certified_radius, find_gains
 from heliograph.random_affine.modes import long_run_law
 from heliograph_studies.intermittent_observations import setting
 from heliograph_studies.intermittent_observations.mean_error import mean_error
@@ -37,8 +30,15 @@ def independent(example, arrival):
 
 
 def bound(system):
-    gains = find_gains(system)
-    return steady(system, gains, system.source(gains)).sum(axis=0)
+    return system.bound(find_gains(system)).sum(axis=0)
+
+
+def lower_bound(system):
+    """What losses add is below E P of any filter: S_j = sum_i T_ij (A S_i A' + law_i Q), S_i left out where z comes."""
+    lost = np.array([len(system.outputs[s]) == 0 for s in system.known])[:, None, None]
+    noise = system.law[:, None, None] * system.process
+    jumps = JumpSystem(system.chain[None], (lost * system.transition)[None], noise[None])
+    return mixed(system.chain, jumps.steady()[0])
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,7 @@ def test_bounds_enclose_the_mean_over_all_patterns():
     """E P_T over all 2^T patterns of losses, started where the bound stands, lies between the bounds at each step."""
     system = lossy(COUPLED, [[0.9, 0.1], [0.7, 0.3]])
     a, c, q, r = (np.asarray(item) for item in COUPLED)
-    gains = find_gains(system)
-    upper = steady(system, gains, system.source(gains))
-    lower = lower_bound(system)
+    upper, lower = system.bound(find_gains(system)), lower_bound(system)
     paths = [(system.law[i], i, u / p) for i, (u, p) in enumerate(zip(upper, system.law, strict=True))]
     for _ in range(9):
         paths = [
@@ -95,7 +93,8 @@ def test_independent_losses_are_a_chain_with_equal_rows():
     """The sum over modes has the radius of the operator by mode; a chain a hair off has the same to that hair."""
     chain = np.array([[0.6, 0.4], [0.6 + 1e-13, 0.4 - 1e-13]])
     by_mode, together = lossy(COUPLED, chain), independent(COUPLED, 0.6)
-    assert len(operator(by_mode, find_gains(by_mode))) == 2 * len(operator(together, find_gains(together)))
+    sizes = [len(item.closed(find_gains(item)).operator()) for item in (by_mode, together)]
+    assert sizes == [2 * 3, 3]
     np.testing.assert_allclose(bound(by_mode), bound(together), rtol=1e-9)
 
 
@@ -119,11 +118,11 @@ def test_a_certificate_does_not_trust_the_gains():
 
 def test_the_radius_is_the_growth_of_the_mean_square_under_the_gains():
     system = lossy(COUPLED, [[0.5, 0.5], [0.8, 0.2]])
-    gains = find_gains(system)
+    jumps = system.closed(find_gains(system), noise=0.0)
     parts = np.array([np.eye(2), np.eye(2)])
     for _ in range(400):
-        before, parts = parts, system.moved(gains, parts, np.zeros_like(parts))
-    np.testing.assert_allclose(parts.sum() / before.sum(), spectral_radius(operator(system, gains)), rtol=1e-9)
+        before, (parts,) = parts, jumps.after(parts)
+    np.testing.assert_allclose(parts.sum() / before.sum(), jumps.radius(), rtol=1e-9)
 
 
 def test_modes_that_tell_the_same_share_their_gain():
@@ -185,7 +184,7 @@ def test_bounds_enclose_the_mean_of_random_systems(seed):
     system = KnownLossSystem(a, q, chain, law, np.arange(3), outputs, noises)
     gains = find_gains(system)
     assert certified_radius(system, gains) < 1
-    upper = steady(system, gains, system.source(gains))
+    upper = system.bound(gains)
     paths = [(p, i, u / p) for i, (u, p) in enumerate(zip(upper, law, strict=True))]
     for _ in range(5):
         paths = [

@@ -1,6 +1,7 @@
 """Linear plants behind links whose losses the receiver knows: gains, certificates of a bounded mean error, its limits.
 
-P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next.
+P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next;
+after mode i it is V_i, so that U_j = sum_i T_ij V_i.
 """
 
 from collections.abc import Iterable, Sequence
@@ -8,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.linear.jump_system import JumpSystem, from_entries, mixed, moved
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import pseudo_solve, spectral_radius
 from heliograph.numerics.types import Float, Int
@@ -39,70 +41,42 @@ class KnownLossSystem(NamedTuple):
     outputs: tuple[Float[np.ndarray, "_ n"], ...]
     noises: tuple[Float[np.ndarray, "_ _"], ...]
 
-    @property
-    def forgets(self) -> bool:
-        """True if the modes are independent over time."""
-        return bool(np.all(self.chain == self.chain[0]))
+    def closed(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
+        """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
 
-    def loops(self, gains: KindGains) -> Parts:
-        """Return F_i = A - K C of each mode."""
-        return np.array([self.transition - gains[s] @ self.outputs[s] for s in self.known])
+        Raises:
+            ValueError: more entries than the limit.
+        """
+        n, modes = len(self.transition), len(self.chain)
+        size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)
+        if size > SIZE_LIMIT:
+            raise fail("boundedness", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
+        loops = [self.transition - gains[s] @ self.outputs[s] for s in self.known]
+        added = [gains[s] @ r @ gains[s].T + self.process for s, r in zip(self.known, self.noises, strict=True)]
+        return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))
 
-    def moved(self, gains: KindGains, parts: Parts, source: Parts) -> Parts:
-        """Return U_j+ = sum_i chain[i, j] (F_i U_i F_i' + source_i): Joseph's form, true of any gains."""
-        loops = self.loops(gains)
-        return np.asarray(np.einsum("ij,iab->jab", self.chain, loops @ parts @ loops.swapaxes(1, 2) + source))
-
-    def source(self, gains: KindGains) -> Parts:
-        """Return the noise that adds to F_i U_i F_i': law_i (K R_i K' + Q)."""
-        modes = zip(self.law, self.known, self.noises, strict=True)
-        return np.array([p * (gains[s] @ r @ gains[s].T + self.process) for p, s, r in modes])
-
-
-def operator(system: KnownLossSystem, gains: KindGains) -> Float[np.ndarray, "N N"]:
-    """U -> sum_i chain[i, j] F_i U_i F_i' on all entries; where modes are independent, that of the sum of all U."""
-    n, modes = len(system.transition), len(system.chain)
-    size = n * n * (1 if system.forgets else modes)
-    if size > SIZE_LIMIT:
-        raise fail("boundedness", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
-    squares = np.array([np.kron(f, f) for f in system.loops(gains)])
-    if system.forgets:
-        return np.asarray(np.tensordot(system.chain[0], squares, axes=1))
-    return np.block([[system.chain[i, j] * squares[i] for i in range(modes)] for j in range(modes)])
-
-
-def steady(system: KnownLossSystem, gains: KindGains, source: Parts) -> Parts:
-    """U = moved(U), for gains under which the operator contracts."""
-    n, matrix = len(system.transition), operator(system, gains)
-    if system.forgets:
-        right = source.sum(axis=0)
-        total = np.linalg.solve(np.eye(n * n) - matrix, right.ravel()).reshape(n, n)
-        solution = system.chain[0][:, None, None] * total
-    else:
-        right = np.einsum("ij,iab->jab", system.chain, source)
-        solution = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
-    return np.asarray((solution + solution.swapaxes(1, 2)) / 2)
+    def bound(self, gains: KindGains) -> Parts:
+        """Return the steady U under gains of a radius below 1."""
+        bound: Parts = mixed(self.chain, self.closed(gains).steady()[0])
+        return bound
 
 
 def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
     """The spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
 
-    Below 1, E P stays bounded under these gains, hence under the best. The witness is U > 0 with U - moved(U) > 0,
-    checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
+    Below 1, E P stays bounded under these gains, hence under the best. The witness is V > 0 with V - V+ > 0 without
+    noise, checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
 
     Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
     """
-    radius = spectral_radius(operator(system, gains))
+    jumps = system.closed(gains)
+    radius = jumps.radius()
     if radius >= BELOW_ONE:
         return radius
-    modes, n = len(system.chain), len(system.transition)
-    share = system.chain[0] if system.forgets else np.full(modes, 1 / modes)
-    items = share[:, None, None] * np.eye(n)
-    reached = np.array([(system.chain[:, j] > 0).any() for j in range(modes)])
-    witness = steady(system, gains, items)
-    left = (witness - system.moved(gains, witness, np.zeros_like(items)))[reached]
-    positive = min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness[reached]).min()) > 0
-    return radius if positive else float("inf")
+    unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
+    (witness,) = jumps._replace(added=unit).steady()
+    left: Parts = witness - moved(jumps.maps[0], mixed(system.chain, witness), 0.0)
+    return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
 
 
 def find_gains(system: KnownLossSystem) -> KindGains:
@@ -116,11 +90,11 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     """
     system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
     size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
-    parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     # Value iteration, renormalised where covariances grow.
     noise, gains = 1.0, _improved(system, parts, 1.0)
     for _ in range(ITERATIONS):
-        parts = system.moved(gains, parts, noise * system.source(gains))
+        (parts,) = system.closed(gains, noise).after(parts)
         grown = np.trace(parts.sum(axis=0)) / size
         if grown > NEGLIGIBLE:
             parts, noise = parts / grown, noise / grown
@@ -129,23 +103,23 @@ def find_gains(system: KnownLossSystem) -> KindGains:
             break
     # Policy iteration, and the certificate rho(operator) < 1.
     gains = _polished(system, gains)
-    if spectral_radius(operator(system, gains)) < BELOW_ONE:
+    if system.closed(gains).radius() < BELOW_ONE:
         return gains
     fresh = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
-    return min(gains, fresh, key=lambda items: spectral_radius(operator(system, items)))
+    return min(gains, fresh, key=lambda items: system.closed(items).radius())
 
 
 def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
     """Policy iteration: gains for what remains under the last ones, their steady bound or the part that grows most."""
-    values, vectors = np.linalg.eig(operator(system, gains))
+    jumps = system.closed(gains)
+    values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
     for _ in range(POLISHING):
-        if radius < BELOW_ONE:
-            parts, noise = steady(system, gains, system.source(gains)), 1.0
-        else:
-            parts, noise = _fastest(system, values, vectors), 1 / NEGLIGIBLE
-        better = _improved(system, parts, noise)
-        values, vectors = np.linalg.eig(operator(system, better))
+        below = radius < BELOW_ONE
+        parts = jumps.steady()[0] if below else _fastest(jumps.shape, values, vectors)
+        better = _improved(system, parts, 1.0 if below else 1 / NEGLIGIBLE)
+        jumps = system.closed(better)
+        values, vectors = np.linalg.eig(jumps.operator())
         reached = float(np.max(np.abs(values)))
         if reached >= max(radius, BELOW_ONE) or _change(gains, better) < CONVERGED:
             break
@@ -153,21 +127,19 @@ def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
     return gains
 
 
-def _fastest(system: KnownLossSystem, values: np.ndarray, vectors: np.ndarray) -> Parts:
+def _fastest(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
     """The covariances that grow by the spectral radius: a positive map has such an eigenvector."""
-    n, eigenvector = len(system.transition), np.real(vectors[:, np.argmax(values.real)])
-    parts = eigenvector.reshape(-1, n, n)
-    parts = parts + parts.swapaxes(1, 2)
-    parts = parts * np.sign(np.trace(parts.sum(axis=0)))
-    parts = parts / np.trace(parts.sum(axis=0)) + np.eye(n) / NEGLIGIBLE
-    return np.asarray(system.chain[0][:, None, None] * parts if system.forgets else parts)
+    parts = from_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
+    return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
 def _improved(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
-    results = []
+    """Gains that are best for U of the V given, of all modes together if V is."""
+    results: list[np.ndarray] = []
+    before: Parts = mixed(system.chain, parts)
     for s, c in enumerate(system.outputs):
         modes = np.flatnonzero(system.known == s)
-        v = parts[modes].sum(axis=0)
+        v = before[modes].sum(axis=0)
         r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
         cross = c @ v @ system.transition.T
         results.append(pseudo_solve(c @ v @ c.T + r, cross).T if len(c) else cross.T)
@@ -178,27 +150,6 @@ def _change(before: KindGains, after: KindGains) -> float:
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0
-
-
-def lower_bound(system: KnownLossSystem) -> Parts | None:
-    """S_i <= U_i of any filter: what a loss adds, S_j = sum_i chain[i, j] (A S_i A' + law_i Q) over i without rows.
-
-    In the other modes law_i Q alone. None where it has no end.
-    """
-    silent = tuple(np.zeros((0, len(system.transition))) if len(c) == 0 else None for c in system.outputs)
-    lost = np.array([silent[s] is not None for s in system.known])
-    n, modes = len(system.transition), len(system.chain)
-    square = np.kron(system.transition, system.transition)
-    source = system.law[:, None, None] * system.process
-    if system.forgets:
-        matrix, right = system.chain[0][lost].sum() * square, source.sum(axis=0)
-    else:
-        blocks = [[system.chain[i, j] * lost[i] * square for i in range(modes)] for j in range(modes)]
-        matrix, right = np.block(blocks), np.einsum("ij,iab->jab", system.chain, source)
-    if spectral_radius(matrix) >= BELOW_ONE:
-        return None
-    solution = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
-    return np.asarray(system.chain[0][:, None, None] * solution if system.forgets else solution).reshape(modes, n, n)
 
 
 UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing

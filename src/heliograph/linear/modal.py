@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from heliograph.linear.jump_system import mixed, moved
 from heliograph.linear.lift import each_step
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
@@ -68,9 +69,9 @@ def modal_system(
     parts = []
     for step in steps:
         maps = [m.maps for m in step.maps if isinstance(m, Stack)]
-        moved, received = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+        move_moments, received = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
         # F, Cov(w) and E_i of one step; Cov(v) = sum_j Spread_j(E_j).
-        transition, process, moments = _moved(moved, rows, moments)
+        transition, process, moments = _after(move_moments, rows, moments)
         noise = np.einsum("jabcd,jcd->ab", received[1], moments)
         output = np.concatenate(list(received[0]), axis=1)
         parts.append((transition, np.zeros(len(transition)), process, output, np.zeros(len(output)), noise))
@@ -85,18 +86,17 @@ def _by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
     return mean, second - np.array([symmetric_product(m, m) for m in mean])
 
 
-def _moved(
-    moved: Moments, rows: np.ndarray, moments: np.ndarray
+def _after(
+    move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
     """F, Cov(w) and E[y~+ y~+' 1{j}]."""
-    mean, spread = moved
+    mean, spread = move
     modes, size = len(moments), moments.shape[-1]
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
-    before = np.einsum("ij,iab->jab", rows, moments)
+    before = mixed(rows, moments)
     added = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
     chosen = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
     apart = np.einsum("ijl,jac,icd,lbd->jalb", chosen, whole, moments, whole)
     apart[np.arange(modes), :, np.arange(modes), :] += added
     transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
-    after = whole @ before @ whole.swapaxes(1, 2) + added
-    return transition, apart.reshape(modes * size, modes * size), after
+    return transition, apart.reshape(modes * size, modes * size), moved(whole, before, added)

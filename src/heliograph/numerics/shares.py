@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from heliograph.numerics.module import readable
 
@@ -30,7 +30,7 @@ def wilson(hits: float, of: float) -> Share:
     """
     if not of:
         return Share(float("nan"), 0.0, 1.0)
-    z = float(ndtri(0.975))
+    z = float(scipy.special.ndtri(0.975))
     p = hits / of
     middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))

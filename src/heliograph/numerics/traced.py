@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import jax.scipy.linalg
 import jax.scipy.special
 import numpy as np
-import scipy.linalg
-import scipy.special
+import scipy
 
 
 def is_traced(*values: object) -> bool:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.linear.jump_system import fixed_point, moved
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, refuse_angles
@@ -42,11 +43,9 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
     Raises:
         ValueError: a plant that is not stable (where A is traced nobody can see it).
     """
-    a, n = transition, len(transition)
+    a = transition
     if is_traced(a, process):
-        xp = library(a, process)
-        total = xp.linalg.solve(np.eye(n * n) - xp.kron(a, a), xp.ravel(process)).reshape(n, n)
-        return (total + total.T) / 2  # type: ignore[no-any-return]
+        return jnp.asarray(fixed_point(lambda x: moved(a, x, 0.0), process))
     check_stable(np.asarray(a))
     # sum_k A^k Q A'^k, with twice as many terms after each doubling.
     total, power = np.asarray(process), np.asarray(a)

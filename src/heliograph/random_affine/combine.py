@@ -1,7 +1,6 @@
 """Maps made of maps: the atom, one random gain times a matrix plus noise; in series, mixed and stacked."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import reduce
 from itertools import product
 
@@ -168,18 +167,9 @@ class AbstractOfMaps(AbstractOfParts):
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
 
     @property
-    def parts(self) -> tuple[AbstractRandomAffine, ...]:
-        """The maps."""
-        return self.maps
-
-    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of others."""
-        return replace(self, maps=parts)
-
-    @property
-    def remembers(self) -> bool:
-        """True if one of the maps remembers."""
-        return any(m.remembers for m in self.maps)
+    def inputs(self) -> int:
+        """Inputs of the first map."""
+        return self.maps[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """The maps' states."""
@@ -215,11 +205,6 @@ class Series(AbstractOfMaps):
         """Outputs of the last map."""
         return self.maps[-1].outputs
 
-    @property
-    def inputs(self) -> int:
-        """Inputs of the first map."""
-        return self.maps[0].inputs
-
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and multiply."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
@@ -242,6 +227,11 @@ class Series(AbstractOfMaps):
             products = corners @ first[:, None]
             first = products.reshape(-1, *products.shape[2:])
         return first
+
+
+def opened(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """Return the maps of a channel in series, those of series within it too; itself alone where it is none."""
+    return [m for affine in channel.maps for m in opened(affine)] if isinstance(channel, Series) else [channel]
 
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:
@@ -334,11 +324,6 @@ class Stack(AbstractOfMaps):
     def outputs(self) -> int:
         """Sum of the maps' outputs."""
         return sum(m.outputs for m in self.maps)
-
-    @property
-    def inputs(self) -> int:
-        """Inputs of each map."""
-        return self.maps[0].inputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and stack the rows."""

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.linear.jump_system import fixed_point, on_entries
 from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
     GainsByFilter,
@@ -100,7 +101,7 @@ def _converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn 
     """Steps of one period, checked for gains under which the second moments converge."""
     check_slots(network, gains)
     steps = periodic_steps(network)
-    radius = spectral_radius(np.asarray(_period(steps, gains)))
+    radius = spectral_radius(np.asarray(_operator(steps, gains)))
     if not radius < 1:
         raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
     return steps
@@ -112,29 +113,16 @@ def check_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
 
 
-def fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
-    """M = step(M) for an affine map of symmetric (d, d) matrices, solved over the d (d + 1) / 2 entries."""
-    linear, constant, (i, j) = _entries(step, d)
-    entries = jnp.linalg.solve(jnp.eye(len(i)) - linear, constant)
-    return jnp.zeros((d, d)).at[i, j].set(entries).at[j, i].set(entries)
-
-
-def _entries(
-    step: Callable[[jax.Array], jax.Array], d: int
-) -> tuple[Float[jax.Array, "e e"], Float[jax.Array, "e"], tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]]:
-    """The affine map on the upper triangle: linear part, constant, and the triangle's indices."""
-    i, j = np.triu_indices(d)
-    basis = np.zeros((len(i), d, d))
-    basis[np.arange(len(i)), i, j] = basis[np.arange(len(i)), j, i] = 1.0
-    constant = step(jnp.zeros((d, d)))
-    images = jax.vmap(lambda b: step(b) - constant)(jnp.asarray(basis))
-    return images[:, i, j].T, constant[i, j], (i, j)
+def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
+    """M = step(M) for an affine map of symmetric (d, d) matrices."""
+    constant, linear = jax.linearize(step, jnp.zeros((d, d)))
+    return jnp.asarray(fixed_point(jax.vmap(linear), constant))
 
 
 def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
     """Moments over a period that ends as it begins; differentiable in the gains. Meaningful if `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    return propagate(steps, fixed_point(lambda m: propagate(steps, m, gains).moments[-1], d), gains)
+    return propagate(steps, affine_fixed_point(lambda m: propagate(steps, m, gains).moments[-1], d), gains)
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
@@ -182,7 +170,7 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
     def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.lax.scan(given, spread, (side, best_gains))
 
-    return jnp.asarray(period(fixed_point(lambda e: period(e)[0], d))[1])
+    return jnp.asarray(period(affine_fixed_point(lambda e: period(e)[0], d))[1])
 
 
 _steady = compiled(steady)
@@ -190,10 +178,11 @@ _steady_behind = compiled(steady_behind)
 
 
 @compiled
-def _period(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
+def _operator(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Linear part of one period of the second moments."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    return _entries(lambda m: propagate(steps, m, gains).moments[-1], d)[0]
+    _, linear = jax.linearize(lambda m: propagate(steps, m, gains).moments[-1], jnp.zeros((d, d)))
+    return jnp.asarray(on_entries(jax.vmap(linear), (d, d)))
 
 
 @compiled

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from heliograph.linear.known_losses import (
     BELOW_ONE,
@@ -15,7 +15,6 @@ from heliograph.linear.known_losses import (
     fastest_unseen,
     find_gains,
     reached,
-    steady,
 )
 from heliograph.linear.steady_state import plant_matrices, sensor_matrices
 from heliograph.model.channel import Channel, parallel
@@ -99,7 +98,7 @@ def certify_boundedness(network: Network) -> Boundedness:
         gains = find_gains(known.system)
         radius = certified_radius(known.system, gains)
         if radius < BELOW_ONE:
-            bound = steady(known.system, gains, known.system.source(gains)).sum(axis=0) if known.exact else None
+            bound = known.system.bound(gains).sum(axis=0) if known.exact else None
             return Boundedness("certified", _certified(a, radius), radius, 0.0, known.gains(gains), bound)
     # Not certified: is there an unstable mode that losses hide?
     unseen = fastest_unseen(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])

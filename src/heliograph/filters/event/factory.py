@@ -1,5 +1,7 @@
 """Factory of the filters behind a sender that decides when to send."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -76,40 +78,28 @@ def event_filter(
     outputs = len(first(sensor).outputs)
     loses = any(_loses(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
+    shared: dict[str, Any] = {
+        "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
+        "loses": loses, "outputs": outputs,
+    }  # fmt: skip
     # A random trigger: one Gaussian is enough.
     if isinstance(trigger, StochasticTrigger | Periodic):
-        return StochasticEventFilter(
-            plant=plant,
-            sensor=sensor,
-            channel=described,
-            trigger=trigger,
-            initial=initial,
-            transform=rule,
-            loses=loses,
-            **sized(_claim_of(plant, sensor, channel, trigger), start, received),
-            outputs=outputs,
-        )
+        claim = _claim_of(plant, sensor, channel, trigger)
+        return StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received))
     # A threshold: which losses and regions the sum holds.
-    threshold = instance(
-        "trigger", trigger, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these"
-    )
+    expected = "SendOnDelta, SendOnPredictionError or another of these"
+    threshold = instance("trigger", trigger, AbstractThreshold, expected)
     if not lost and loses and threshold.reference == "sent":
         raise fail("lost", "at least 1, since transmissions may be lost", lost)
     _check_region(threshold, outputs, first(channel).outputs, steps)
     return EventFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
         trigger=threshold,
-        initial=initial,
-        transform=rule,
         known=known,
         lost=lost,
-        loses=loses,
         delivers=all(_delivers(step) for step in steps),
         alike=all(_alike(step) for step in steps),
+        **shared,
         **sized("nominal", start, received),
-        outputs=outputs,
     )
 
 
@@ -146,8 +136,9 @@ def _is_known(channel: SideInformation) -> bool:
 
 def _spread(channel: SideInformation) -> np.ndarray:
     """Spread of gain and noise, without what rounding leaves of a known gain behind losses."""
-    mean, spread = np.asarray(channel.mean), np.asarray(channel.spread)
-    size = np.abs(mean[..., :, None, :, None] * mean[..., None, :, None, :])
+    gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
+    size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
+    size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
     return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
 
 

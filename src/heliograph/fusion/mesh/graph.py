@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.sparse import csr_array
+import scipy
 
 from heliograph.numerics.check import array, fail, items, scalar, shown, table
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
@@ -61,11 +61,11 @@ class Graph(NamedTuple):
             least = width
         return parts
 
-    def reach(self) -> csr_array:
+    def reach(self) -> "scipy.sparse.csr_array":
         """Matrix (node, node) with a one where a node receives another, itself included."""
         receiver, column = np.nonzero(self.present)
         ones = np.ones(len(receiver), dtype=np.int32)
-        return csr_array((ones, (receiver, self.senders[receiver, column])), shape=(len(self.nodes),) * 2)
+        return scipy.sparse.csr_array((ones, (receiver, self.senders[receiver, column])), shape=(len(self.nodes),) * 2)
 
 
 def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
@@ -156,7 +156,7 @@ def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
     count, label = connected_components(reach, connection="strong")
     # Components that a component receives from, over all paths: a row of the reach is one of receivers.
     receivers, senders = reach.nonzero()
-    between = csr_array((np.ones(len(senders)), (label[receivers], label[senders])), shape=(count, count))
+    between = scipy.sparse.csr_array((np.ones(len(senders)), (label[receivers], label[senders])), shape=(count, count))
     behind = [breadth_first_order(between, c, return_predecessors=False) for c in range(count)]
     places = [np.flatnonzero(np.isin(label, seen)) for seen in behind]
     return [places[c] for c in label]

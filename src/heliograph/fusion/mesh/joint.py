@@ -9,7 +9,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import bsr_array
+import scipy
 
 from heliograph.fusion.mesh.gains import Gains
 from heliograph.numerics.traced import is_traced, library
@@ -41,7 +41,9 @@ def spread(
         empty = jnp.zeros((nodes, nodes, n, n)).at[np.arange(nodes)[:, None], senders]
         return empty.add(there).swapaxes(1, 2).reshape(nodes * n, nodes * n)
     ends = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    return bsr_array((np.asarray(blocks)[present], senders[present], ends), shape=(nodes * n,) * 2, blocksize=(n, n))
+    return scipy.sparse.bsr_array(
+        (np.asarray(blocks)[present], senders[present], ends), shape=(nodes * n,) * 2, blocksize=(n, n)
+    )
 
 
 def congruence(m: Any, joint: Float[Array, "N N"]) -> Float[Array, "N N"]:

@@ -17,12 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.linear.jump_system import JumpSystem
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
-from heliograph.planning.moments import moments_over, steady_covariance, steady_moment
+from heliograph.planning.moments import moments_over, steady_moment
 
 DOUBLINGS = 60
 CONVERGED = 1e-16  # relative change of the fixed point by a doubling: rounding
@@ -103,22 +104,8 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
 def adjoint(plants: Plants, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Adjoint L_k, the gradient of the cost with respect to P_k through all later steps."""
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
-    adjoints = np.array(weights)
-    if plants.start is None:
-        adjoints[-1] = _around_period(phi, weights)
-    for k in range(len(p) - 2, -1, -1):
-        adjoints[k] += phi[k + 1].T @ adjoints[k + 1] @ phi[k + 1]
-    return adjoints
-
-
-def _around_period(phi: Matrices, weights: Matrices) -> Float[np.ndarray, "n n"]:
-    """L = S + R' L R at a period's last step, R = Phi_last ... Phi_0: the Lyapunov equation."""
-    total, product = weights[-1], np.eye(phi.shape[-1])
-    for k, factor in enumerate(phi):
-        product = factor @ product
-        if k + 1 < len(phi):
-            total = total + product.T @ weights[k] @ product
-    return np.asarray(steady_covariance(product.T, total))
+    always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
+    return always.adjoint(weights, plants.start is None)[:, 0]
 
 
 Powers = Float[np.ndarray, "time hop"]

@@ -11,10 +11,9 @@ from heliograph.numerics.linalg import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library, placed, stacked
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, fold
 from heliograph.random_affine.combine import GainAndNoise, Series, Stack
 from heliograph.random_affine.law import Constant, Discrete
-from heliograph.random_affine.moments.lift import Lift
 from heliograph.random_affine.moments.monomials import Moments, count, exponents, position, product_table
 
 CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
@@ -46,8 +45,6 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
             return _stack_interval(channel, order)
         case GainAndNoise(law=Discrete() as law):
             return _atom_interval(channel, law, order)
-        case Lift():
-            raise fail("uncertain lifted channel", f"at most {CORNERS} corner laws", corners)
     raise fail("uncertain channel", f"at most {CORNERS} corner laws", corners)
 
 
@@ -189,12 +186,12 @@ def has_known_mean(described: SecondOrder) -> bool:
 
 def has_known_gain(channel: AbstractRandomAffine) -> bool:
     """Return whether z = G y + n with a constant G."""
-    match channel:
-        case GainAndNoise():
-            return isinstance(channel.law, Constant)
-        case Series() | Stack():
-            return all(has_known_gain(affine) for affine in channel.maps)
-    return False
+    holds: bool = fold(channel, {
+        GainAndNoise: lambda hop, _: isinstance(hop.law, Constant),
+        Series | Stack: lambda _, parts: all(parts),
+        AbstractRandomAffine: lambda *_: False,
+    })  # fmt: skip
+    return holds
 
 
 @cached

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_flow
+import scipy
 
 from heliograph.fusion.mesh.graph import Graph, graph_of, upstream
 from heliograph.fusion.mesh.rules import DiffusionWeights, FrozenWeights
@@ -190,9 +189,9 @@ def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -
         rows = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
         columns = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
         data = np.concatenate([units, np.full(sees.sum(), 2**30, dtype=np.int32)]).astype(np.int32)
-        flow = csr_array((data, (rows, columns)), shape=(source + 1, source + 1))
+        flow = scipy.sparse.csr_array((data, (rows, columns)), shape=(source + 1, source + 1))
         for i in np.flatnonzero(~sees):
-            cut = maximum_flow(flow, source, int(i)).flow_value / UNIT
+            cut = scipy.sparse.csgraph.maximum_flow(flow, source, int(i)).flow_value / UNIT
             if cut <= 2 * np.log(abs(value)) * (1 - MODE):
                 raise fail(what, f"losses below {1 / abs(value) ** 2:.3g} in all of what node {names[i]!r} learns of a "
                            f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip

@@ -6,7 +6,7 @@ Without noise J+ = E[M J M'], where a lost edge (j, i) takes D_ij = c_ij F_i A (
 """
 
 import numpy as np
-from scipy.sparse import bsr_array
+import scipy
 
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.numerics.check import fail
@@ -67,7 +67,9 @@ def _growth(
     mean = arrives[:, :, None, None] * pulled
     mean[:, 0] = alone + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
     ends = np.concatenate([[0], np.cumsum(graph.present.sum(axis=1))])
-    m = bsr_array((mean[graph.present], graph.senders[graph.present], ends), shape=(nodes * n,) * 2, blocksize=(n, n))
+    m = scipy.sparse.bsr_array(
+        (mean[graph.present], graph.senders[graph.present], ends), shape=(nodes * n,) * 2, blocksize=(n, n)
+    )
     variance = (arrives * (1 - arrives))[:, :, None, None]
     # Second moments without noise, in units of their size before a step.
     joint, logarithms, places, senders = np.eye(nodes * n), [], np.arange(nodes), graph.senders

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
+import scipy
 
 from heliograph.fusion.mesh.joint import blocks_of, congruence, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
@@ -200,7 +200,7 @@ def best_possible(
             moments = steps[-1].plant
     # Whose measurement of each age can have come, from the last step back.
     count = len(mesh.nodes)
-    known: Any = csr_array(np.eye(count, dtype=np.int32))
+    known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for k in reversed(range(len(u))):
         for number in reversed(range(mesh.edges.rounds)):
@@ -233,7 +233,7 @@ def _reached(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     """Matrix of what is known through one exchange more, earlier: a one where some message carried it."""
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
-    step = csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
+    step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
     reached = known @ step
     reached.data = np.minimum(reached.data, 1)
     return reached

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import gammaincinv, ndtri
+import scipy
 
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.float64 import compiled
@@ -179,13 +179,13 @@ def consistency(
         means=by_step,
         intervals=every,
         autocorrelation=correlation,
-        autocorrelation_bound=float(ndtri(quantiles[1]) / np.sqrt(present.sum())),
+        autocorrelation_bound=float(scipy.special.ndtri(quantiles[1]) / np.sqrt(present.sum())),
     )
 
 
 def _interval(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     """Quantiles of the mean of `count` values with so many degrees of freedom together."""
-    return np.asarray(2 * gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
+    return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
 def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:

@@ -24,6 +24,7 @@ from heliograph.simulation.results.labelled import (
     dataset_of,
     filled,
     names_of,
+    placed,
     record_fields,
     record_frame,
     units_of,
@@ -191,15 +192,9 @@ class Record(Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        filters = list(dict.fromkeys(name for estimate in self.estimates.values() for name in estimate))
+        filters, results = placed(nodes, self.estimates)
         lead, axes = (*([] if self.runs is None else [self.runs]), len(self.time)), [] if self.runs is None else ["run"]
         n, sizes = len(self.states), (len(nodes), len(filters))
-        # Estimates and measurements with their places.
-        results = [
-            ((nodes.index(node), filters.index(name)), estimate)
-            for node, by_name in self.estimates.items()
-            for name, estimate in by_name.items()
-        ]
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         most = max((z.shape[-1] for _, z in received), default=0)
         # Variables, NaN where a node has no such filter or component.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance, items
@@ -124,7 +124,9 @@ class ErrorStatistics:
         self._tell()
         n = self.outer.shape[-1]
         mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
-        width = float(stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
+        width = (
+            float(scipy.special.stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
+        )
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":

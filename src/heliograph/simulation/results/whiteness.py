@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import toeplitz
-from scipy.special import ndtr
+import scipy
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of, over_rows
@@ -90,8 +89,10 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
     # Lag 1 for significance; all lags for the predictable share (Yule and Walker).
-    p_value = float(2 * ndtr(-abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
-    share = float(correlation @ np.linalg.lstsq(toeplitz([1.0, *correlation[:-1]]), correlation)[0])
+    p_value = (
+        float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
+    )
+    share = float(correlation @ np.linalg.lstsq(scipy.linalg.toeplitz([1.0, *correlation[:-1]]), correlation)[0])
     power = (size, size_error) if claimed else (np.nan, np.nan)
     return MemoryTest(correlation, error, p_value, share, *power)
 

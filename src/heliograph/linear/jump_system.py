@@ -1,0 +1,123 @@
+"""Second moments of Markov jump linear systems, zeta+ = F_j zeta + w where the step is in mode j.
+
+X_j = E[zeta zeta' 1{mode j}] follows X_j+ = F_j Y_j F_j' + S_j, Y_j = sum_i T_ij X_i, with T_ij = P(j in this step | i
+in the one before) and S_j the noise, P(j) Cov w, and all that random coefficients add. One mode is a covariance.
+
+Arrays are NumPy's or JAX's. X is (..., M, n, n), or (..., 1, n, n), its sum over the modes, before a step whose chain
+forgets the mode before: all rows of T are alike.
+
+Source: Costa, Fragoso and Marques, Discrete-time Markov jump linear systems (2005), chapter 3.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array, Float, Int
+
+Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a first axis
+
+
+def mixed(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
+    """Return Y_j = sum_i T_ij X_i."""
+    *axes, modes, n, _ = moments.shape
+    sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
+    return sums.reshape(*axes, -1, n, n)
+
+
+def moved(maps: Float[Array, "..."], moments: Float[Array, "..."], added: Array | float) -> Any:
+    """Return F X F' + S, of each mode."""
+    return maps @ moments @ maps.swapaxes(-1, -2) + added
+
+
+class JumpSystem(NamedTuple):
+    """Steps of a jump system: chain T into each step, maps F and noises S by mode."""
+
+    chain: Float[Array, "time M M"]
+    maps: Float[Array, "time M n n"]
+    added: Float[Array, "time M n n"]
+
+    def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
+        """Propagate X from before the first step: X after each step."""
+        steps = []
+        for chain, maps, added in zip(*self, strict=True):
+            moments = moved(maps, mixed(chain, moments), added)
+            steps.append(moments)
+        return steps
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of X before the first step."""
+        _, modes, n, _ = self.maps.shape
+        return (1 if np.all(self.chain[0] == self.chain[0][:1]) else modes, n, n)
+
+    def operator(self) -> Float[np.ndarray, "e e"]:
+        """Return the matrix of X -> X over all steps, without noise, on the entries of upper triangles."""
+        return np.asarray(on_entries(self._replace(added=0.0 * self.added)._around, self.shape))
+
+    def radius(self) -> float:
+        """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
+        return spectral_radius(self.operator())
+
+    def steady(self) -> Float[np.ndarray, "time M n n"]:
+        """Solve for X after each of steps that repeat for ever, of a radius below 1."""
+        start = fixed_point(self._replace(added=0.0 * self.added)._around, self._around(np.zeros(self.shape)))
+        after = np.array(self.after(start))
+        return np.asarray(after + after.swapaxes(-1, -2)) / 2
+
+    def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
+        """Derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
+
+        L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l, from zero behind the last step, or around a period.
+        """
+        shape = self.shape
+
+        def back(behind: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+            ahead = []
+            for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
+                ahead.append(weight + behind)
+                behind = mixed(chain.T, moved(maps.swapaxes(-1, -2), ahead[-1], 0.0))
+            return behind[..., : shape[0], :, :], ahead[::-1]
+
+        behind = np.zeros(shape)
+        if forever:
+            behind = fixed_point(lambda later: back(later, 0.0 * weights)[0], back(behind, weights)[0])
+        ahead = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in back(behind, weights)[1]])
+        return np.asarray(ahead + ahead.swapaxes(-1, -2)) / 2
+
+    def _around(self, moments: np.ndarray) -> np.ndarray:
+        """Propagate X from before the first step to after the last, summed over modes that are forgotten there."""
+        last = self.after(moments)[-1]
+        return np.asarray(last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True))
+
+
+def on_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
+    """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
+    _, where, basis = _triangles(shape)
+    matrix: Array = linear(basis)[:, *where].T
+    return matrix
+
+
+def fixed_point(linear: Maps, constant: Array) -> Any:
+    """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
+    matrix, where = on_entries(linear, constant.shape), _triangles(constant.shape)[1]
+    solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
+    return from_entries(solution, constant.shape)
+
+
+def from_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
+    """Return symmetric matrices with these entries in their upper triangles."""
+    return entries[_triangles(shape)[0]]
+
+
+@lru_cache(8)
+def _triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
+    """Place of each entry among those of the upper triangles, these, and matrices of one entry each."""
+    where = np.nonzero(np.triu(np.ones(shape)))
+    places = np.empty(shape, dtype=int)
+    places[where] = places[*where[:-2], where[-1], where[-2]] = np.arange(len(where[0]))
+    return places, where, np.eye(len(where[0]))[:, places]
