@@ -53,6 +53,14 @@ def covariance_step(
     return Corrected(gain, predicted, (after + after.T) / 2)
 
 
+def information_step(
+    predicted: Float[np.ndarray, "*nodes n n"], information: Float[np.ndarray, "*nodes n n"]
+) -> Float[np.ndarray, "*nodes n n"]:
+    """P = (P-^-1 + J)^-1 = (I + P- J)^-1 P- by the information J = C' Cov(v)^-1 C; P- may be singular."""
+    after = np.linalg.solve(np.eye(predicted.shape[-1]) + predicted @ information, predicted)
+    return np.asarray(after + after.swapaxes(-1, -2)) / 2
+
+
 def nearest_covariance(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """The positive semidefinite matrix nearest to a symmetric one, by its correlation matrix: zero for what is below.
 
