@@ -76,9 +76,21 @@ def test_both_layouts_are_read_alike(tmp_path):
     assert np.isfinite(read.ranges).sum() == len(rows) and len(read.time) <= 200
 
 
+def altered(folder):
+    """The reference of a drive that is written into the folder, to be made bad."""
+    as_tables(folder / "nlos_a9", *made(0, 10.0))
+    return folder / "nlos_a9" / "truth.csv"
+
+
 @pytest.mark.parametrize(("write_bad", "message"), [
     (lambda folder: None, "--recording: expected a folder with drives"),
     (lambda folder: write(folder / "x" / "ranges.csv", ["time"], [[0]]), "ranges.csv: expected columns time, anchor"),
+    (lambda folder: altered(folder).unlink(), "truth.csv: expected a table of the recording, got no such file"),
+    (lambda folder: write(altered(folder), ["time", "x", "y", "z"], [[0, 0, 0, 1], [9, 1, 1, 1]]),
+     "reference of drive nlos_a9: expected rows within 0.5 m of the height of its first, got none"),
+    (lambda folder: write(altered(folder).parents[1] / "drives.csv", ["drive", "window_start", "window_end"],
+                          [["nlos_a9", 500, 600]]),
+     "window of drive nlos_a9: expected seconds in which there are ranges, got 500 to 600"),
 ])  # fmt: skip
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path, write_bad, message):
     write_bad(tmp_path)

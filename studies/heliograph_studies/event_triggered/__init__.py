@@ -225,7 +225,10 @@ def _rooms(outcome: Outcome) -> Figure:
     axes.axhline(1.0, color=MUTED, linewidth=0.8)
     axes.set_xticks(place, list(outcome.rooms), rotation=30, ha="right")
     axes.set(yscale="log", ylabel="squared error over claimed")
-    axes.legend(fontsize="small")
+    axes.set_yticks((0.5, 1, 2, 4))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+    axes.legend(fontsize="small", ncols=2)
     return figure
 
 
@@ -237,6 +240,7 @@ def _messages(outcome: Outcome) -> Figure:
         axes.plot(curve["messages"], curve["error"], "o-", color=colour, label=rule)
     axes.plot(outcome.curves["on change"]["messages"], outcome.bound, "--", color=MUTED, label="least error")
     axes.set(xscale="log", xlabel="messages an hour", ylabel="error (K)")
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.legend(fontsize="small")
     return figure
 

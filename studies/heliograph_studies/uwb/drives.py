@@ -126,8 +126,12 @@ def _drive(
     if unknown:
         raise fail(f"ranges of drive {name}", "anchors of anchors.csv", unknown)
     truth = truth[np.abs(truth[:, 3]) < FLAT]
+    if not len(truth):
+        raise fail(f"reference of drive {name}", f"rows within {FLAT:g} m of the height of its first", "none")
     known = listed.get(name)
     window = known[:2] if known else turning_points(name, truth)
+    if not np.any((ranges[:, 0] >= window[0]) & (ranges[:, 0] <= window[1])):
+        raise fail(f"window of drive {name}", "seconds in which there are ranges", f"{window[0]:g} to {window[1]:g}")
     return Drive(
         name, ranges[:, 0], np.array([number[a] for a in ranges[:, 1]]), ranges[:, 2], ranges[:, 3],
         tuple(f"{a:g}" for a in anchors[:, 0]), anchors[:, 1:], truth[:, 0], truth[:, 1:], window,
@@ -174,5 +178,7 @@ def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[dict[str, str]]:
                 raise fail(str(path), f"columns {', '.join(columns)}", f"no {', '.join(missing)}")
             reader.fieldnames = names
             yield from reader
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise fail(str(path), "a table of the recording", (error.strerror or "an error").lower()) from None
+    except UnicodeDecodeError as error:
         raise fail(str(path), "a table of the recording", str(error)[:80]) from None

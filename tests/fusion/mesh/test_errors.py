@@ -24,9 +24,9 @@ def lossy():
     return network(RULES, link=LINK)
 
 
-def central(steps, rows=ROWS):
+def central(steps):
     """Covariance of the filter that receives every measurement, after so many steps."""
-    a, q, p, h, r = models(PLANT, rows)
+    a, q, p, h, r = models()
     total = sum(x.T @ np.linalg.solve(y, x) for x, y in zip(h, r, strict=True))
     for _ in range(steps):
         p = a @ p @ a.T + q
@@ -72,18 +72,6 @@ def test_where_everybody_receives_everybody_every_node_is_the_central_filter():
         # best weights of equal estimates are found to the root of what they are taken to differ by
         assert errors.actual[-1] == pytest.approx(np.tile(central(6), (4, 1, 1)), rel=1e-9)
         assert errors.claimed[-1] == pytest.approx(errors.actual[-1], rel=1e-9)
-
-
-@pytest.mark.slow
-def test_a_node_that_receives_all_is_a_centre_that_uses_all_reports():
-    rows = ROWS | {"c": ([[0.4, 0.5]], 0.5)}  # each observes both modes
-    star = network({"m": hg.fusion.MatrixWeights()}, {"b": ["a", "c", "d"]}, rows=rows)
-    hub = hg.simulation.mesh_errors(star, "m", 6)
-    assert hub.actual[-1, hub.nodes.index("b")] == pytest.approx(central(6, rows), rel=1e-9)
-    leaves = {name: node for name, node in star.nodes.items() if name != "b"}
-    centre = hg.Network(PLANT, leaves, {"reports": hg.Fusion("own", hg.fusion.AllReports())})
-    # Reports of a filter's estimates are worth its measurements where it loses none.
-    assert hg.simulation.fused_covariances(centre, 6)["reports"][-1] == pytest.approx(central(6, rows), rel=1e-9)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Factory of the filters behind a sender that decides when to send."""
 
+from typing import Any
+
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, sized
@@ -9,6 +11,7 @@ from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.side_information import SideInformation, by_pattern
 from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, check_plant
@@ -71,42 +74,30 @@ def event_filter(
     outputs = len(first(sensor).outputs)
     loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
+    shared: dict[str, Any] = {
+        "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
+        "loses": loses, "outputs": outputs,
+    }  # fmt: skip
     # A random trigger: one Gaussian is enough.
     if isinstance(trigger, StochasticTrigger | Periodic):
         sure = is_linear(plant, sensor) and all(_is_known(step) for step in steps) and not uncertain_chain(channel)
         hidden = loses and trigger.losses == "unknown" and isinstance(trigger, StochasticTrigger)
-        return StochasticEventFilter(
-            plant=plant,
-            sensor=sensor,
-            channel=described,
-            trigger=trigger,
-            initial=initial,
-            transform=rule,
-            loses=loses,
-            **sized("exact" if sure and not hidden else "nominal", start, received),
-            outputs=outputs,
-        )
+        claim: Claim = "exact" if sure and not hidden else "nominal"
+        return StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received))
     # A threshold: which losses and regions the sum holds.
-    threshold = instance(
-        "trigger", trigger, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these"
-    )
+    expected = "SendOnDelta, SendOnPredictionError or another of these"
+    threshold = instance("trigger", trigger, AbstractThreshold, expected)
     if not lost and loses and threshold.reference == "sent":
         raise fail("lost", "at least 1, since transmissions may be lost", lost)
     _check_region(threshold, outputs, first(channel).outputs, steps)
     return EventFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
         trigger=threshold,
-        initial=initial,
-        transform=rule,
         known=known,
         lost=lost,
-        loses=loses,
         delivers=all(_delivers(step) for step in steps),
         alike=all(_alike(step) for step in steps),
+        **shared,
         **sized("nominal", start, received),
-        outputs=outputs,
     )
 
 

@@ -4,7 +4,7 @@ Each uses the Markov chain, updates through each mode's map with a Gaussian upda
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -240,37 +240,18 @@ def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Ar
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
-def link_by_mode(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, nodes: int
-) -> tuple[AbstractPlant, Angles, Array, SideInformation | OverTime]:
-    """Return the plant at the start, received angles, the modes' initial law, and the channel by mode.
-
-    A gain that drifts has `nodes` modes.
-    """
+def by_mode(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
+) -> dict[str, Any]:
+    """Return the fields that filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
-    return start, received_angles(plant, sensor, channel), *describe_modes(channel, nodes)
-
-
-def _build(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    merging: AbstractMerging,
-    transform: AbstractTransform | None,
-    nodes: int,
-) -> MultipleModelFilter:
-    start, angles, initial, described = link_by_mode(plant, sensor, channel, nodes)
-    return MultipleModelFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
-        initial=initial,
-        merging=merging,
-        transform=Cubature() if transform is None else transform,
-        observed_angles=angles,
+    angles, (initial, described) = received_angles(plant, sensor, channel), describe_modes(channel, nodes)
+    return {
+        "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "observed_angles": angles,
+        "transform": Cubature() if transform is None else transform,
         **sized("nominal", start, first(channel).outputs),
-    )
+    }  # fmt: skip
 
 
 def imm_filter(
@@ -296,7 +277,7 @@ def imm_filter(
 
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
-    return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)
+    return MultipleModelFilter(merging=MergeByNextMode(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
 def gpb1_filter(
@@ -320,7 +301,7 @@ def gpb1_filter(
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970).
     """
-    return _build(plant, sensor, channel, MergeAll(), transform, nodes)
+    return MultipleModelFilter(merging=MergeAll(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
 def gpb2_filter(
@@ -343,4 +324,4 @@ def gpb2_filter(
 
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """
-    return _build(plant, sensor, channel, MergeByMode(), transform, nodes)
+    return MultipleModelFilter(merging=MergeByMode(), **by_mode(plant, sensor, channel, transform, nodes))
