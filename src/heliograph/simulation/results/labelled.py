@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from heliograph.simulation.centres.uplinks import Uplink
-    from heliograph.simulation.results.record import Record
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
@@ -24,28 +23,28 @@ COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRE
 SENT = ("saturated", "symbols")
 
 
-def record_frame(record: "Record") -> "pd.DataFrame":
-    """Table of a record: a row for each time, or run and time; columns (node, filter, quantity, component, other)."""
+def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
+    """Table of a record's fields: a row for each time, or run and time; columns as in LEVELS."""
     import pandas as pd
 
     # Columns: truth, measurements, estimates, uplinks.
     columns: dict[Column, np.ndarray] = {}
-    if record.truth is not None:
-        columns |= {("", "", "truth", s, ""): record.truth[..., i] for i, s in enumerate(record.states)}
-    for node, z in record.measurements.items():
+    if fields["truth"] is not None:
+        columns |= {("", "", "truth", s, ""): fields["truth"][..., i] for i, s in enumerate(fields["states"])}
+    for node, z in fields["measurements"].items():
         columns |= {(node, "", "measurement", f"z{i}", ""): z[..., i] for i in range(z.shape[-1])}
-    for node, filters in record.estimates.items():
+    for node, filters in fields["estimates"].items():
         for name, estimate in filters.items():
-            columns |= _of_estimate(node, name, estimate, record.states)
-    for name, uplink in record.uplinks.items():
+            columns |= _of_estimate(node, name, estimate, fields["states"])
+    for name, uplink in fields["uplinks"].items():
         for i, node in enumerate(uplink.nodes):
             for quantity in SENT:
                 values = getattr(uplink, quantity)
-                columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(record.states)}
+                columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(fields["states"])}
     # Rows: runs one after another.
-    index = pd.Index(record.time, name="time")
-    if record.runs is not None:
-        index = pd.MultiIndex.from_product([range(record.runs), index], names=["run", "time"])
+    index = pd.Index(fields["time"], name="time")
+    if runs is not None:
+        index = pd.MultiIndex.from_product([range(runs), index], names=["run", "time"])
     frame = pd.DataFrame({i: values.reshape(-1) for i, values in enumerate(columns.values())}, index=index)
     frame.columns = _labels(list(columns))
     return frame

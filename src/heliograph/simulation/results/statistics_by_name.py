@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from heliograph.disk.quoting import in_figure
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
@@ -25,7 +26,15 @@ from heliograph.simulation.results.labelled import (
     uplinks_from,
     values_of,
 )
-from heliograph.simulation.results.plots import plot_statistics
+from heliograph.simulation.results.plots import (
+    FAR,
+    chosen_filters,
+    colour_of,
+    legend_outside,
+    panels,
+    state_places,
+    with_unit,
+)
 from heliograph.simulation.results.saved import Saved
 from heliograph.simulation.results.statistics import ErrorStatistics, matrices
 
@@ -178,7 +187,25 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ValueError: a node, filter or state that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        return plot_statistics(self, node, filters, states, axes)
+        # What is drawn, on which axes.
+        node, filters = chosen_filters(self, node, filters)
+        places = state_places(states, self.states)
+        time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
+        drawn = panels(axes, len(places), time, self.units)
+        for panel, i in zip(drawn, places, strict=True):
+            for number, name in enumerate(filters):
+                # Solid: actual; dashed: claimed.
+                score, colour = self[node][name], colour_of(number)
+                claimed = score.claimed()[:, i, i]
+                panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=in_figure(name))
+                panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+            panel.set_ylabel(f"RMSE of {with_unit(self.states[i], self.units)}")
+            # A log axis where one is far larger than another.
+            ends = [float(np.sqrt(self[node][name].actual()[-1, i, i])) for name in filters]
+            if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
+                panel.set_yscale("log")
+        legend_outside(drawn[0], "dashed: claimed")
+        return drawn
 
     def failures(self) -> list[str]:
         """List filters without a valid estimate in some run, a line each, as for a record.

@@ -17,9 +17,9 @@ from jax.extend.core import ClosedJaxpr
 from heliograph.codegen.accumulated import Accumulated, Begun
 from heliograph.codegen.compiled import threads
 from heliograph.codegen.engine import attempted
-from heliograph.codegen.graph import Buffer, Type, Unsupported
 from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
 from heliograph.codegen.memory import LONG, InMemory
+from heliograph.codegen.nodes import Buffer, Type, Unsupported
 from heliograph.codegen.program import Program, Summed, folded
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
