@@ -126,7 +126,7 @@ class Turned(AbstractRandomAffine):
     ),
     "simulation/description/links.py": (
         "        # One case for each way of making a channel.\n",
-        "        case _ if type(channel).__name__ == 'Turned':\n            return 'turned'\n",
+        "        __import__('heliograph.random_affine').random_affine.Turned: lambda *_: 'turned',\n",
     ),
 }  # fmt: skip
 

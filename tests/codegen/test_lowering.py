@@ -7,8 +7,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.codegen.engine import engine_of
-from heliograph.codegen.graph import Graph, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import Lowering, scalars, traced
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower, needed
 
 

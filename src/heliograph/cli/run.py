@@ -71,7 +71,6 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.cli.run import read_mapped
     from heliograph.disk.quoting import visible
     from heliograph.files.bag import is_bag
     from heliograph.files.events import holds_events

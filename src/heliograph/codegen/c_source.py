@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from heliograph.codegen.graph import Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
+from heliograph.codegen.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type, Unsupported
 from heliograph.codegen.program import needed
 from heliograph.numerics.check import fail
 

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from heliograph.codegen.compiled import Compiled, target
-from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import like
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import to_numpy

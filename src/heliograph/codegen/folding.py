@@ -3,16 +3,13 @@
 A product with zero is zero only if the other factor is known to be finite: data may be NaN.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from heliograph.codegen.graph import Graph, Node, Type
+from heliograph.codegen.nodes import Node, Number, Type
 
 COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
 DTYPES: dict[str, Any] = {
@@ -23,6 +20,18 @@ DTYPES: dict[str, Any] = {
     "u32": np.uint32,
     "u64": np.uint64,
 }
+
+
+class Graph(Protocol):
+    """A program that makes nodes; `numbers` are those that are known not to be NaN."""
+
+    numbers: set[Node]
+
+    def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
+        """Return the node of an operation."""
+
+    def constant(self, value: Number, type: Type) -> Node:
+        """Return the node of a constant."""
 
 
 def _shift_left(a: Any, b: Any) -> Any:

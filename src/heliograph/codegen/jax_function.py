@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.graph import Block, Buffer, Check, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.memory import InMemory
+from heliograph.codegen.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.program import Program, needed
 from heliograph.codegen.rules.random_bits import hashed
 from heliograph.numerics.types import PyTree

@@ -11,8 +11,9 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
-from heliograph.codegen.graph import TYPES, Buffer, Graph, Key, Node, Type, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.memory import LONG, InMemory
+from heliograph.codegen.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
 from heliograph.numerics.types import PyTree
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory

@@ -5,7 +5,8 @@ from itertools import product
 
 import numpy as np
 
-from heliograph.codegen.graph import Block, Buffer, Graph, Node, Type, Unsupported
+from heliograph.codegen.graph import Graph
+from heliograph.codegen.nodes import Block, Buffer, Node, Type, Unsupported
 
 LONG = 64  # numbers: a known array that is longer is a table in memory
 LARGE = 4096  # numbers: an array in memory that is longer is not loaded whole

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen.graph import Block, Buffer, Graph, Guard, Loop, Node, Store
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
 from heliograph.codegen.memory import InMemory
+from heliograph.codegen.nodes import Block, Buffer, Guard, Loop, Node, Store
 from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     arrived,
     calls,

@@ -12,9 +12,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.folding import is_finite
-from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Value, array_of, code_line, scalars, traced, type_of
 from heliograph.codegen.memory import LARGE, InMemory
+from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
 from heliograph.filters.base import AbstractFilter, step_with_judgement
 from heliograph.filters.plausibility import LIMIT
 from heliograph.numerics.check import InputError, fail

@@ -7,7 +7,7 @@ import numpy as np
 
 import heliograph
 from heliograph.codegen.c_source import CSource, Place, Real, c_type, literal
-from heliograph.codegen.graph import Node, Type, Unsupported
+from heliograph.codegen.nodes import Node, Type, Unsupported
 from heliograph.disk.quoting import visible
 from heliograph.export.program import StepProgram, no_c, place_of
 from heliograph.filters.base import AbstractFilter

@@ -1,15 +1,17 @@
 """Bags of ROS: MCAP and SQLite files, folders of them, and bags of ROS 1, read by the sources of a network."""
 
+import os
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from heliograph.files.bag_layout import Decoder, RawMessage
-from heliograph.files.cut_bag import is_cut, whole_part
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources
 from heliograph.numerics.check import InputError, fail, shown_error
@@ -23,6 +25,11 @@ OFTEN = 5000  # messages that are decoded at once, and between two reports of pr
 LARGE = 1 << 22  # bytes that are decoded at once
 LISTED = 8  # topics in one line
 Progress = Callable[[int, int], None]
+MAGIC = b"\x89MCAP0\r\n"  # how MCAP begins and ends
+DATA_END, FOOTER = 0x0F, 0x02  # records of MCAP that follow the data
+# An end of data without a checksum, and a footer without a summary: all is then found by reading on.
+ENDING = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
+BLOCK = 1 << 20  # bytes copied at once
 
 
 def is_bag(path: Path) -> bool:
@@ -248,3 +255,41 @@ def _listed(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
 
 def _counted(counts: dict[str, int]) -> str:
     return _listed([f"{topic} ({count})" for topic, count in counts.items()])
+
+
+def is_cut(path: Path) -> bool:
+    """Return whether a file begins as MCAP and does not end so."""
+    if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
+        return False
+    with path.open("rb") as file:
+        begins = file.read(len(MAGIC)) == MAGIC
+        file.seek(-len(MAGIC), os.SEEK_END)
+        return begins and file.read() != MAGIC
+
+
+def whole_records(path: Path) -> int:
+    """Return the number of bytes up to the end of the last record of data that is whole."""
+    size, end = path.stat().st_size, len(MAGIC)
+    with path.open("rb") as file:
+        while end + 9 <= size:
+            file.seek(end)
+            kind, length = struct.unpack("<BQ", file.read(9))
+            if kind in (DATA_END, FOOTER) or end + 9 + length > size:
+                break
+            end += 9 + length
+    return end
+
+
+@contextmanager
+def whole_part(path: Path) -> Iterator[tuple[Path, int]]:
+    """Yield a temporary copy of what is whole, ended as a file of MCAP ends, and its number of bytes of data."""
+    end = whole_records(path)
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        with path.open("rb") as file, copy.open("wb") as whole:
+            left = end
+            while left and (block := file.read(min(BLOCK, left))):
+                whole.write(block)
+                left -= len(block)
+            whole.write(ENDING)
+        yield copy, end

@@ -48,7 +48,7 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
             got = "a folder" if path.is_dir() else "nothing of that name"
             raise fail(f"network {source_name}", "a Python file", got)
         with _importing_from(path.parent):
-            module = _guarded(lambda: _run_file(path), source_name, path)
+            module = _guarded(lambda: _run_source(path, path.read_bytes()), source_name, path)
             return _pick(module, name, source_name, path), vars(module)
     # A module, by its name.
     with _importing_from(Path.cwd()):
@@ -119,10 +119,6 @@ def _source(module: str) -> Path | None:
     if spec is None:
         raise ModuleNotFoundError(f"No module named {module!r}")
     return Path(spec.origin) if spec.origin else None
-
-
-def _run_file(path: Path) -> ModuleType:
-    return _run_source(path, path.read_bytes())
 
 
 def _run_source(path: Path, source: str | bytes) -> ModuleType:

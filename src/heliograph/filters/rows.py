@@ -2,21 +2,50 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import computed
-from heliograph.model.estimate import Claim, Innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
-if TYPE_CHECKING:
-    from heliograph.filters.base import AbstractFilter
+
+class Steps(Protocol):
+    """A filter as a scan over rows reads it."""
+
+    @property
+    def claim(self) -> Claim:
+        """Meaning of its covariances."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of its inputs."""
+
+    @property
+    def received(self) -> int:
+        """Length of its measurement."""
+
+    @property
+    def horizon(self) -> int | None:
+        """Number of steps that it covers."""
+
+    def init(self) -> PyTree:
+        """State before the first row."""
+
+    def predict(self, state: PyTree, u: ArrayLike, k: Array) -> PyTree:
+        """Prior of a row."""
+
+    def correct(self, state: PyTree, z: ArrayLike, k: Array) -> tuple[PyTree, Innovation]:
+        """Posterior of a row, and its innovation."""
+
+    def after_step(self, state: PyTree, k: Array) -> Estimate:
+        """Estimate of a row."""
 
 
 @readable
@@ -50,7 +79,7 @@ class Filtered:
 
 
 def over_rows(
-    filter: "AbstractFilter",
+    filter: Steps,
     z: Float[Array, "steps received"],
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
@@ -66,7 +95,7 @@ def over_rows(
     return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
 
 
-def filtered(filter: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Filtered:
+def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
     mean, covariance, innovation = computed(_results, _by_xla, (filter, *data_of(filter, z, u)))
     return Filtered(
@@ -75,7 +104,7 @@ def filtered(filter: "AbstractFilter", z: ArrayLike, u: ArrayLike | None) -> Fil
     )  # fmt: skip
 
 
-def _results(filter: "AbstractFilter", z: Array, u: Array) -> PyTree:
+def _results(filter: Steps, z: Array, u: Array) -> PyTree:
     def single(state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
         estimate = filter.after_step(state, k)
         return estimate.mean, estimate.covariance, innovation
@@ -87,7 +116,7 @@ _by_xla = quickly_compiled(_results)
 
 
 def data_of(
-    filter: "AbstractFilter", measurements: ArrayLike, inputs: ArrayLike | None
+    filter: Steps, measurements: ArrayLike, inputs: ArrayLike | None
 ) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
     """Return measurements and inputs of a filter as rows; without inputs a filter that takes none is assumed."""
     z = rows("measurements", measurements, None, filter.received or None, missing=True)

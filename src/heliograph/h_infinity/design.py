@@ -5,7 +5,7 @@ sum_s E|M (x - xhat)|^2 < gamma^2 (sum_s |v|^2 + |rho|^2 + xi_0' W xi_0) with xi
 disturbances that are not zero. It is a guarantee as long as the growth constants are true (`check_growth`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -163,12 +163,10 @@ def horizon_design(
     solved = [layout.unpack(unknown) for layout, unknown in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
     weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, solved)]
-    for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
-        fixed = step.target - square * step.energy
-        fixed[: 2 * n, : 2 * n] -= weights[k]
-        if not _holds(step, unknowns, fixed, SCREEN * square):
-            text = f"the solver's answer fails at step {k} ({status})"
-            return _empty(system, separate, float("nan"), text)._replace(failed_step=k)
+    failed = _first_failing(steps, solved, weights, square)
+    if failed is not None:
+        text = f"the solver's answer fails at step {failed} ({status})"
+        return _empty(system, separate, float("nan"), text)._replace(failed_step=failed)
     # back to the user's units
     level = float(np.sqrt(square)) * coordinates.unit
     chosen = given_gains
@@ -178,6 +176,18 @@ def horizon_design(
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     proven = all_multipliers(system, multipliers, separate)
     return HInfinityDesign(level, chosen, unscaled, proven, True, status)
+
+
+def _first_failing(
+    steps: Sequence[StepMatrices], solved: Sequence[Unknowns], weights: Sequence[np.ndarray], square: float
+) -> int | None:
+    """Number of the first step, with these weights before each, at which an inequality does not hold."""
+    for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
+        fixed = step.target - square * step.energy
+        fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
+        if not _holds(step, unknowns, fixed, SCREEN * square):
+            return k
+    return None
 
 
 class _Recursion:

@@ -1,6 +1,6 @@
 """The error system of H-infinity designs, and joint second moments of a channel's gain and of its noise's gain."""
 
-from functools import reduce, singledispatch
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, rank, scalar, standard_deviations
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 
 ROUNDING = 1e-13  # relative to the largest eigenvalue of a covariance: smaller ones are zero up to rounding
@@ -54,19 +54,22 @@ class DisturbedGain(NamedTuple):
         return factors
 
 
-@singledispatch
 def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
     """Joint moments of a channel's gain and of the gains of its noise sources, in the order of the signal's way.
 
     A noise of covariance R counts as rank(R) sources of unit size; its mean is not used. Uncertain probabilities count
     as nominal.
     """
-    raise fail("channel", "hops, series, mixtures and stacks of them", type(channel).__name__)
+    gain: DisturbedGain = fold(channel, {
+        GainAndNoise: lambda hop, _: _of_hop(hop),
+        Series: lambda _, parts: reduce(_after, parts),
+        Mixture: lambda mixture, parts: _of_mixture(mixture, parts),
+        Stack: lambda stack, parts: _stack(parts, stack.inputs),
+    }, "channel", "hops, series, mixtures and stacks of them")  # fmt: skip
+    return gain
 
 
-@disturbed_gain.register
-def _(channel: GainAndNoise) -> DisturbedGain:
-    check_forgets("channel of a design", channel)
+def _of_hop(channel: GainAndNoise) -> DisturbedGain:
     values, vectors = np.linalg.eigh(np.asarray(channel.noise.covariance))
     used = values > ROUNDING * np.max(values, initial=0.0)
     root = np.sqrt(values[used]) * vectors[:, used]
@@ -81,11 +84,6 @@ def _(channel: GainAndNoise) -> DisturbedGain:
     )
 
 
-@disturbed_gain.register
-def _(channel: Series) -> DisturbedGain:
-    return reduce(_after, [disturbed_gain(affine) for affine in channel.maps])
-
-
 def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
     """[G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2], with independent factors."""
     passed = _stack([first, _known(np.eye(then.disturbances))], shared=0)
@@ -94,19 +92,12 @@ def _after(first: DisturbedGain, then: DisturbedGain) -> DisturbedGain:
     return DisturbedGain(mean, second, first.inputs)
 
 
-@disturbed_gain.register
-def _(channel: Mixture) -> DisturbedGain:
-    parts = [disturbed_gain(affine) for affine in channel.maps]
+def _of_mixture(channel: Mixture, parts: list[DisturbedGain]) -> DisturbedGain:
     widened = [_place(gain, channel.inputs, parts, i) for i, gain in enumerate(parts)]
     weights = np.asarray(channel.choice.probabilities)
     mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
     second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
     return DisturbedGain(mean, second, channel.inputs)
-
-
-@disturbed_gain.register
-def _(channel: Stack) -> DisturbedGain:
-    return _stack([disturbed_gain(affine) for affine in channel.maps], channel.inputs)
 
 
 def _known(matrix: np.ndarray) -> DisturbedGain:

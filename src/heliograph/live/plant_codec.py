@@ -1,8 +1,10 @@
 """Serialisation of a plant as bytes, which restore the same bits."""
 
 import json
+import math
 import struct
 from datetime import datetime
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,48 +13,64 @@ from heliograph.live.plant import Link, Plant
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
+TYPES = ("<i8", "<i8", "<f8", "<f8", "<f8")  # of the parts after the head
+
+
+class PlantParts(NamedTuple):
+    """Parts of a plant's bytes, in their order: a head of JSON, integers, then doubles.
+
+    Shapes: keys (rows, 2), the node and step number of each row; events (events, 3), their row, node and count; table
+    (rows, width); times (events,) and values (numbers,) of the events.
+    """
+
+    head: dict[str, Any]
+    keys: np.ndarray
+    events: np.ndarray
+    table: np.ndarray
+    times: np.ndarray
+    values: np.ndarray
+
+    def to_bytes(self) -> bytes:
+        """Serialise: lengths of the parts, then the parts."""
+        head = json.dumps(self.head).encode()
+        numbers = [np.asarray(a, dtype=kind).tobytes() for a, kind in zip(self[1:], TYPES, strict=True)]
+        return b"".join([HEAD.pack(len(head), len(self.keys), len(self.events), len(self.values)), head, *numbers])
+
+    @staticmethod
+    def of(data: bytes, width: int) -> "PlantParts":
+        """Read bytes, of rows with so many numbers."""
+        length, rows, events, numbers = HEAD.unpack_from(data)
+        at, arrays = HEAD.size + length, []
+        shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
+        for kind, shape in zip(TYPES, shapes, strict=True):
+            arrays.append(np.frombuffer(data, kind, math.prod(shape), at).reshape(shape))
+            at += arrays[-1].nbytes
+        return PlantParts(json.loads(data[HEAD.size : HEAD.size + length]), *arrays)
 
 
 def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
-    """Serialise a plant that has no pending changes: a head of JSON, then integers, then doubles."""
+    """Serialise a plant that has no pending changes."""
     rows = plant.rows.held
     origin = None if plant.origin is None else plant.origin.isoformat()
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
-    head = json.dumps({"now": plant.now, "forced": plant.forced, "origin": origin, "links": links}).encode()
-    # Integers: step numbers of the rows, then (row, node, count) of each event.
     events = [(i, name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
-    whole = [number for row in rows for number in row.key[1:]]
-    whole += [number for i, name, _ in events for number in (i, name[0], name[1])]
-    values = np.concatenate([np.zeros(0), *(values for _, _, values in events)])
-    return b"".join(
-        [
-            # Lengths of the parts, then the parts: head, integers, rows, times and values of events.
-            HEAD.pack(len(head), len(rows), len(events), len(values)),
-            head,
-            np.array(whole, dtype="<i8").tobytes(),
-            fleet.pool.table[[row.slot for row in rows]].astype("<f8").tobytes(),
-            np.array([name[2] for _, name, _ in events], dtype="<f8").tobytes(),
-            values.astype("<f8").tobytes(),
-        ]
-    )
+    return PlantParts(
+        head={"now": plant.now, "forced": plant.forced, "origin": origin, "links": links},
+        keys=np.array([row.key[1:] for row in rows], dtype=np.int64),
+        events=np.array([(i, *name[:2]) for i, name, _ in events], dtype=np.int64),
+        table=fleet.pool.table[[row.slot for row in rows]],
+        times=np.array([name[2] for _, name, _ in events]),
+        values=np.concatenate([np.zeros(0), *(values for _, _, values in events)]),
+    ).to_bytes()
 
 
 def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     """Restore a plant from bytes, with its rows in slots of the fleet's table."""
-    length, count, received, numbers = HEAD.unpack_from(data)
-    head, at = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length
-    # The parts in the order in which `plant_bytes` writes them.
-    whole = np.frombuffer(data, "<i8", 2 * count + 3 * received, at).tolist()
-    at += 8 * len(whole)
-    width = fleet.pool.table.shape[1]
-    table = np.frombuffer(data, "<f8", count * width, at).reshape(count, width)
-    at += 8 * table.size
-    times = np.frombuffer(data, "<f8", received, at).tolist()
-    values = np.frombuffer(data, "<f8", numbers, at + 8 * received)
+    head, keys, events, table, times, values = PlantParts.of(data, fleet.pool.table.shape[1])
     # Rows, each in a new slot; then their events.
-    rows = [_row(fleet, table[i], whole[2 * i], whole[2 * i + 1]) for i in range(count)]
+    rows = [_row(fleet, numbers, *key) for numbers, key in zip(table, keys.tolist(), strict=True)]
     begin = 0
-    for time, i, node, sequence in zip(times, *(whole[2 * count + j :: 3] for j in range(3)), strict=True):
+    for time, (i, node, sequence) in zip(times.tolist(), events.tolist(), strict=True):
         end = begin + fleet.size(node)
         rows[i].events[node, sequence, time] = values[begin:end]
         begin = end

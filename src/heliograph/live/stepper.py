@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.codegen.compiled import Alone
 from heliograph.codegen.engine import attempted, setting
-from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.filters.base import AbstractFilter
 from heliograph.live.static import Static

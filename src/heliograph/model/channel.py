@@ -13,7 +13,7 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, independent
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, held_maps, independent
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
 from heliograph.random_affine.erasure import Erasure
@@ -281,10 +281,8 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             starts = np.cumsum([0, *(affine.outputs for affine in channel.maps)])
             items = zip(starts, channel.maps, strict=False)
             return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
-        case Erasure() | OneStepLate():
-            return carried(channel.base, sent)
-        case Delayed():  # one of the angles that were sent arrives; a time stamp stands after it
-            return carried(channel.link, sent)
+        case Erasure() | OneStepLate() | Delayed():  # a time stamp of what is late stands after it
+            return carried(held_maps(channel)[0], sent)
         # All choices must agree.
         case Mixture() | Modes():
             results = {carried(affine, sent) for affine in channel.maps}

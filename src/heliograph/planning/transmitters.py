@@ -16,7 +16,7 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Float, Scalar
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, fold, held_maps, holding
 from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import AbstractHop, GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
@@ -78,6 +78,7 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | Non
 
 def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> tuple[AbstractRandomAffine, Position]:
     """The changed channel, and the position behind it; its signal is set by the series that the channel is in."""
+    inside = held_maps(channel)
     match channel:
         # A hop that transmits is visited; a wire is not.
         case AbstractHop():
@@ -86,52 +87,44 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, position: Position) -> t
             after = position._replace(hops=position.hops + 1)
             return visit(f"{position.prefix}hop{after.hops}", channel, position.signal), after
         case Series():
-            visited, position = _visit_chain(channel.maps, visit, position)
+            visited, position = _visit_chain(inside, visit, position)
         case Stack():
-            prefixes = [f"{position.prefix}part{i}." for i in range(1, len(channel.maps) + 1)]
-            positions = [Position(prefix, 0, position.signal) for prefix in prefixes]
-            visited = [_visit(affine, visit, at)[0] for affine, at in zip(channel.maps, positions, strict=True)]
+            visited = [_visit(affine, visit, at)[0] for affine, at in _numbered(inside, position, "part")]
         case Mixture() | Modes():
             # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
-            several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in channel.maps) > 1
-            prefixes = [f"{position.prefix}choice{i}." for i in range(1, len(channel.maps) + 1)]
-            positions = [Position(prefix, 0, position.signal) if several else position for prefix in prefixes]
-            pairs = [_visit(affine, visit, at) for affine, at in zip(channel.maps, positions, strict=True)]
+            several = isinstance(channel, Mixture) and sum(not is_silent(affine) for affine in inside) > 1
+            choices = _numbered(inside, position, "choice") if several else [(affine, position) for affine in inside]
+            pairs = [_visit(affine, visit, at) for affine, at in choices]
             visited = [affine for affine, _ in pairs]
             position = position if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case ModeOutput():
             return channel, position
-        # What wraps a link: inside it.
+        # What wraps a link: inside it; the line of past signals goes into a map of the line.
         case Erasure() | OneStepLate() | Delayed() | OfLine():
-            return _visit_inside(channel, visit, position)
+            if isinstance(channel, OfLine) and position.signal is not None:
+                line = _line(position.signal.second, channel.inputs // sent(channel))
+                position = position._replace(signal=position.signal._replace(second=line))
+            link, position = _visit(inside[0], visit, position)
+            visited = [link, *inside[1:]]
         case _:
             expected = "hops in series, stacks, mixtures, modes, losses and delays"
             raise fail("transmitters of a channel", expected, type(channel).__name__)
-    # The same object where nothing has changed.
-    if all(changed is before for changed, before in zip(visited, channel.maps, strict=True)):
-        return channel, position
-    return eqx.tree_at(lambda c: c.maps, channel, tuple(visited)), position
+    return holding(channel, visited), position
 
 
-def _visit_inside(
-    channel: AbstractRandomAffine, visit: Visit, position: Position
-) -> tuple[AbstractRandomAffine, Position]:
-    """The changed channel around a link, which a line of past signals goes into where the channel is of such a line."""
-    name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
-    if isinstance(channel, OfLine) and position.signal is not None:
-        line = _line(position.signal.second, channel.inputs // sent(channel))
-        position = position._replace(signal=position.signal._replace(second=line))
-    inner, position = _visit(getattr(channel, name), visit, position)
-    if inner is getattr(channel, name):
-        return channel, position
-    return eqx.tree_at(lambda c: getattr(c, name), channel, inner), position
+def _numbered(
+    maps: Sequence[AbstractRandomAffine], position: Position, word: str
+) -> list[tuple[AbstractRandomAffine, Position]]:
+    """Maps side by side, each with its position: names begin with the word and the map's number."""
+    at = [position._replace(prefix=f"{position.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
+    return list(zip(maps, at, strict=True))
 
 
 def _visit_chain(
     maps: Sequence[AbstractRandomAffine], visit: Visit, position: Position
 ) -> tuple[list[AbstractRandomAffine], Position]:
     """The changed maps of a series, each of which receives what comes through those before it."""
-    parts, signal = [], position.signal
+    parts, signal = list[AbstractRandomAffine](), position.signal
     for i, affine in enumerate(maps):
         changed, position = _visit(affine, visit, position._replace(signal=signal))
         parts.append(changed)
@@ -142,16 +135,19 @@ def _visit_chain(
 
 def _arrival(channel: AbstractRandomAffine) -> Scalar:
     """Probability that a signal comes through."""
-    if not channel.erases:
-        return 1.0
-    match channel:
-        case Erasure():
-            return plain(channel.arrival) * _arrival(channel.base)
-        case Series():
-            return prod(_arrival(affine) for affine in channel.maps)
-        case Delayed():
-            return _arrival(channel.link)
-    raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
+    probability: Scalar = fold(channel, {
+        Erasure: lambda loss, parts: plain(loss.arrival) * parts[0],
+        Series: lambda _, parts: prod(parts),
+        Delayed: lambda _, parts: parts[0],
+        AbstractRandomAffine: _certain,
+    })  # fmt: skip
+    return probability
+
+
+def _certain(channel: AbstractRandomAffine, _: object) -> Scalar:
+    if channel.erases:
+        raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
+    return 1.0
 
 
 def _behind(channel: AbstractRandomAffine, second: Second) -> Second:

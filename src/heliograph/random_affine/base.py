@@ -1,10 +1,10 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 from math import prod
-from typing import NamedTuple, TypeVar
+from types import UnionType
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -45,8 +45,8 @@ class AbstractRandomAffine(Module):
 
     @property
     def erases(self) -> bool:
-        """True if outputs can be NaN: lost, and the receiver knows."""
-        return False
+        """True if outputs can be NaN: lost, and the receiver knows; by default, if a map among the fields erases."""
+        return any(affine.erases for affine in held_maps(self))
 
     @property
     def past(self) -> int:
@@ -135,18 +135,13 @@ class AbstractOfParts(AbstractRandomAffine):
     """Random affine map made of independent others, whose moments are linear in the law of each."""
 
     @property
-    def parts(self) -> tuple[AbstractRandomAffine, ...]:
-        """The maps that this one is made of."""
-        raise NotImplementedError
+    def parts(self) -> Sequence[AbstractRandomAffine]:
+        """The maps that this one is made of: those among its fields."""
+        return held_maps(self)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the same map made of others."""
-        raise NotImplementedError
-
-    @property
-    def erases(self) -> bool:
-        """True if one of the parts erases."""
-        return any(affine.erases for affine in self.parts)
+        return holding(self, parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return the same map made of each combination of the parts' extremes."""
@@ -179,21 +174,6 @@ class AbstractOfOne(AbstractOfParts):
         return self.parts[0].init(key)
 
 
-class AbstractWithBase(AbstractOfOne):
-    """Random affine map made of one other, its field `base`."""
-
-    base: eqx.AbstractVar[AbstractRandomAffine]
-
-    @property
-    def parts(self) -> tuple[AbstractRandomAffine, ...]:
-        """The base."""
-        return (self.base,)
-
-    def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map with another base."""
-        return replace(self, base=parts[0])
-
-
 class AbstractOfOneShape(AbstractRandomAffine):
     """Random affine map that is at each step one of several maps of one shape."""
 
@@ -209,11 +189,6 @@ class AbstractOfOneShape(AbstractRandomAffine):
         """Inputs of each map."""
         return self.maps[0].inputs
 
-    @property
-    def erases(self) -> bool:
-        """True if one of the maps erases."""
-        return any(m.erases for m in self.maps)
-
     def check_shapes(self, name: str) -> None:
         """Raise ValueError where the maps have several shapes."""
         shapes = [(m.outputs, m.inputs) for m in self.maps]
@@ -223,11 +198,44 @@ class AbstractOfOneShape(AbstractRandomAffine):
 
 def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
+    return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
 
-    def is_map(leaf: object) -> bool:
-        return isinstance(leaf, AbstractRandomAffine)
 
-    return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
+def holding(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
+    """Return the map with these in place of its `held_maps`; itself where they are the same ones."""
+    leaves, tree = _fields(channel)
+    among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
+    changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
+    same = all(after is before for after, before in zip(changed, leaves, strict=True))
+    rebuilt: T = channel if same else jax.tree.unflatten(tree, changed)
+    return rebuilt
+
+
+def _fields(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
+    return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
+
+
+def fold(
+    channel: AbstractRandomAffine,
+    cases: Mapping[type | UnionType, Callable[[Any, list[T]], T]],
+    name: str = "channel",
+    expected: str = "a map of a known kind",
+) -> T:
+    """Return the value of a channel from the values of its `held_maps`, one case for each kind of map.
+
+    Args:
+        channel: a tree of maps.
+        cases: value of a map, from the map and the values of those it holds, by kind; the first that fits counts.
+        name: name of the channel in the refusal of other kinds ("channel" unless given).
+        expected: kinds that there are cases for, in words ("a map of a known kind" unless given).
+
+    Raises:
+        ValueError: a map of another kind.
+    """
+    for kind, case in cases.items():
+        if isinstance(channel, kind):
+            return case(channel, [fold(affine, cases, name, expected) for affine in held_maps(channel)])
+    raise fail(name, expected, type(channel).__name__)
 
 
 class AbstractModal(AbstractRandomAffine):

@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, AbstractWithBase, as_maps
+from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
 from heliograph.random_affine.law import Discrete
@@ -32,7 +32,7 @@ class AbstractOfLine(AbstractOfOne):
         raise NotImplementedError
 
     @property
-    def parts(self) -> tuple[AbstractRandomAffine, ...]:
+    def parts(self) -> Sequence[AbstractRandomAffine]:
         """The map of the line."""
         return (self.line,)
 
@@ -165,7 +165,7 @@ def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) ->
     return OfLine(chosen, past) if past else chosen
 
 
-class Held(AbstractWithBase):
+class Held(AbstractOfOne):
     """Storage of a relay: received signals of this step and `steps` before, (r_k, ..., r_{k-steps}).
 
     A map of the line of what was sent. Draws are stored: a value that is forwarded twice has its gain and noise twice.

@@ -16,12 +16,13 @@ from heliograph.numerics.traced import library, stacked
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import (
     AbstractModal,
+    AbstractOfOne,
     AbstractOfOneShape,
     AbstractRandomAffine,
-    AbstractWithBase,
     as_maps,
     check_forgets,
     given,
+    held_maps,
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
@@ -105,7 +106,7 @@ class ModeOutput(AbstractModal):
         return known(np.zeros((1, self.sent)), library(state).stack([state]))
 
 
-class OneStepLate(AbstractWithBase):
+class OneStepLate(AbstractOfOne):
     """Map of which each step receives what was drawn at the step before; NaN at the first."""
 
     base: AbstractRandomAffine
@@ -243,10 +244,7 @@ def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
             return max(degree_in(affine, identity) for affine in channel.maps)
         case Lift():
             return channel.degree * degree_in(channel.base, identity)
-    parts = jax.tree.leaves(
-        channel, is_leaf=lambda leaf: leaf is not channel and isinstance(leaf, AbstractRandomAffine)
-    )
-    return sum(degree_in(leaf, identity) for leaf in parts if isinstance(leaf, AbstractRandomAffine))
+    return sum(degree_in(affine, identity) for affine in held_maps(channel))
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel

@@ -27,10 +27,12 @@ from .storage.store_protocol import (
 from .storage.store import (
     Store as Store,
 )
+from .running import (
+    connected as connected,
+)
 from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
-    connected as connected,
     Part as Part,
     part_of as part_of,
     word as word,

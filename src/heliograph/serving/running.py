@@ -19,7 +19,7 @@ from heliograph.live.lanes import Lanes
 from heliograph.numerics.check import check_count, fail
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, Part, TakenOverError, connected, word
+from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, word
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.service import Service
@@ -28,6 +28,32 @@ from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
+
+
+def connected(address: Address, part: Part = WHOLE, translator: Translator | None = None) -> Transport:
+    """Return the transport for one part of the plants through the broker at this address.
+
+    Args:
+        address: the broker; its `kind`, mqtt, nats or opc.tcp, selects the protocol.
+        part: the part of the plants whose messages are read; by default all.
+        translator: what reads the topics of others; None reads those of the service alone.
+
+    Raises:
+        ValueError: an OPC UA server without sources.
+    """
+    if address.kind == "opc.tcp":
+        if translator is None:
+            raise fail(f"{address}", "sources in the network's file, by identifiers of variables", "none")
+        from heliograph.serving.brokers.opcua import OpcUa
+
+        return OpcUa(address, translator)
+    if address.kind == "mqtt":
+        from heliograph.serving.brokers.mqtt import Mqtt
+
+        return Mqtt(address, part, translator)
+    from heliograph.serving.brokers.nats import Nats
+
+    return Nats(address, part, translator)
 
 
 class Leased(Protocol):

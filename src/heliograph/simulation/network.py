@@ -107,17 +107,7 @@ class Network(Module):
         check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
-        # Nodes and filters fit the plant; draws need names with distinct checksums.
-        states, inputs = self.states, self.inputs
-        for name, node in self.nodes.items():
-            if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
-                check_type(f"node {name!r}", node, Node if relays is None and common is None else ReceivingNode)
-            for label, element in node.filters.items():
-                check_sizes(f"filter {label!r} of node {name!r}", element, states, inputs)
-        if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
-            raise fail("node names", "names with distinct checksums", list(self.nodes))
-        if self.fused and FUSED in self.nodes:
-            raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+        self._check_nodes()
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = _grouped((name, (_world(n), n.filters, meshes[name])) for name, n in self.nodes.items())
@@ -129,15 +119,31 @@ class Network(Module):
         self.mesh_kinds = tuple(
             Kind(g, (m,)) for m in sorted(self.meshes) for g, names in enumerate(self.groups) if m in meshes[names[0]]
         )
-        # Sensors and channels of each group fit, then fusions.
+        self._check_links()
+        self._check_fused()
+        for name, mesh in self.meshes.items():
+            check_mesh(name, mesh, self)
+
+    def _check_nodes(self) -> None:
+        """Check that nodes and filters fit the plant, and that names have distinct checksums, as draws need them."""
+        kind = Node if self.relays is None and self.common is None else ReceivingNode
+        for name, node in self.nodes.items():
+            if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
+                check_type(f"node {name!r}", node, kind)
+            for label, element in node.filters.items():
+                check_sizes(f"filter {label!r} of node {name!r}", element, self.states, self.inputs)
+        if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
+            raise fail("node names", "names with distinct checksums", list(self.nodes))
+        if self.fused and FUSED in self.nodes:
+            raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+
+    def _check_links(self) -> None:
+        """Check that sensors and channels fit each other, one of each group."""
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
-                received_angles(plant, node.sensor, node.channel)
-        self._check_fused()
-        for name, mesh in self.meshes.items():
-            check_mesh(name, mesh, self)
+                received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
         for name, fusion in self.fused.items():

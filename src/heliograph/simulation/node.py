@@ -1,9 +1,11 @@
 """Nodes of a network: a sensor, the channel of its signal, and the filters that receive it."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Protocol
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.gaussian_sum import EventFilter
@@ -11,10 +13,13 @@ from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
+from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import alike, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.numerics.check import fail, shown, table
@@ -203,6 +208,54 @@ class Common(Module):
 
     sensor: AnySensor
     channel: Channel
+
+
+class HasNodes(Protocol):
+    """A network as its checks and its diagram read it."""
+
+    @property
+    def plant(self) -> AnyPlant:
+        """Plant of all nodes."""
+
+    @property
+    def nodes(self) -> dict[str, Node | ReceivingNode]:
+        """Nodes by name."""
+
+    @property
+    def fused(self) -> dict[str, Fusion | AbstractFilter]:
+        """Fusions of the nodes' estimates, and filters of all measurements, by name."""
+
+    @property
+    def relays(self) -> RelayNetwork | None:
+        """Relays that filter and forward."""
+
+    @property
+    def common(self) -> Common | None:
+        """Sensor and channel of all nodes together."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the nodes, in the given order."""
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+
+    def rows(self) -> dict[str, np.ndarray]:
+        """Places of each node's measurement in that of the common channel."""
+
+    def claims(self) -> dict[str, dict[str, Claim]]:
+        """Claims by node and filter."""
+
+    def nodes_with(self, name: str) -> list[str]:
+        """Nodes that have a filter of this name."""
+
+    def mesh_nodes(self, name: str) -> tuple[str, ...]:
+        """Nodes of a fusion between neighbours."""
 
 
 def _predicts(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:

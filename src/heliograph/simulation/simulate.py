@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, get_args, overload
+from typing import Any, Literal, cast, get_args
 
 import equinox as eqx
 import jax
@@ -31,7 +31,7 @@ from heliograph.simulation.runs.lanes import (
     is_shared,
     one_processor,
 )
-from heliograph.simulation.runs.native_runs import natively
+from heliograph.simulation.runs.native import natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finished, reduced_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
@@ -39,38 +39,8 @@ from heliograph.smoothing.modes import AbstractSmoothing
 
 Progress = TypeAliasType("Progress", Callable[[int, int], None])
 Seed = TypeAliasType("Seed", int | jax.Array)  # or a JAX key
-Reducer = TypeAliasType("Reducer", AbstractReducer[Any])
+Reducer = TypeAliasType("Reducer", AbstractReducer[Result], type_params=(Result,))
 Precision = TypeAliasType("Precision", Literal["float64", "float32"])
-
-
-@overload
-def monte_carlo(
-    network: Network,
-    horizon: int,
-    runs: int,
-    key: Seed,
-    keep: None = None,
-    inputs: ArrayLike | None = None,
-    chunk: int = 2048,
-    progress: Progress | None = None,
-    first_run: int = 0,
-    precision: Precision = "float64",
-    smooth: AbstractSmoothing | None = None,
-) -> Record: ...
-@overload
-def monte_carlo(
-    network: Network,
-    horizon: int,
-    runs: int,
-    key: Seed,
-    keep: AbstractReducer[Result],
-    inputs: ArrayLike | None = None,
-    chunk: int = 2048,
-    progress: Progress | None = None,
-    first_run: int = 0,
-    precision: Precision = "float64",
-    smooth: AbstractSmoothing | None = None,
-) -> Result: ...
 
 
 def monte_carlo(
@@ -78,14 +48,14 @@ def monte_carlo(
     horizon: int,
     runs: int,
     key: Seed,
-    keep: Reducer | None = None,
+    keep: "Reducer[Result] | None" = None,
     inputs: ArrayLike | None = None,
     chunk: int = 2048,
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
     smooth: "AbstractSmoothing | None" = None,
-) -> "Record | Any":
+) -> "Result":
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
     A run's draws depend on the key, the run, the step and the node's name alone, so neither the chunk size nor another
@@ -108,7 +78,7 @@ def monte_carlo(
             by default. Warns of filters that are not consistent by their NIS.
 
     Returns:
-        A `Record` for trajectories, else the reducer's result.
+        A `Record` for trajectories, else what the reducer collects.
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
@@ -122,22 +92,17 @@ def monte_carlo(
     if check_count("first_run", first_run, 0) % BLOCK:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
     network.check_horizon(horizon)
-    reducer: AbstractReducer[Record] | AbstractReducer[Any] = Trajectories() if keep is None else keep
+    reducer = cast(AbstractReducer[Result], Trajectories()) if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
-    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
-        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
-    single = precision == "float32"
+    single = _is_single(precision)
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and not network.meshes and one_processor():
-        any_reducer: AbstractReducer[PyTree] = reducer
-        native_result: Record | Any = natively(
-            network, u, base, any_reducer, first_run, runs, chunk, progress, smoothing
-        )
-        if native_result is not None:
-            return native_result
+        by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
+        if by_native_code is not None:
+            return by_native_code
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
@@ -146,8 +111,13 @@ def monte_carlo(
     if single:
         network = network.in_single_precision()
         smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
-    outcome: Record | Any = finished(job.reducer, recorded, network, smoothing)
-    return outcome
+    return finished(reducer, recorded, network, smoothing)
+
+
+def _is_single(precision: Precision) -> bool:
+    if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
+        raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
+    return precision == "float32"
 
 
 class _Job(Module):

@@ -147,69 +147,85 @@ class AllFilters(Module):
         `skip` has the reasons of the same form not to use data.
         """
         filter_states, central, quantizer_states, centre_states, reporting, tested = states
-        # The nodes' filters.
+        # The nodes' filters, and central ones on all measurements in the order of the nodes.
         reasons = [None] * len(filter_states) if skip is None else skip[0]
         stepped = [
             stacked.step(state, z[stacked.group], u, k, why)
             for stacked, state, why in zip(self.alike, filter_states, reasons, strict=True)
         ]
-        estimates = tuple(single.estimate for _, single in stepped)
-        # Central filters, on all measurements in the order of the nodes.
         joined = jnp.concatenate([jnp.ravel(values) for values in z])
         joined = joined if self.order is None else joined[self.order]
         received = {
             name: filter_step(filter, central[name], joined, u, k, self.smooths, self.judges, skip and skip[1][name])
             for name, filter in self.central.items()
         }
-        fused = {name: single.estimate for name, (_, single) in received.items()}
-        uplinks: dict[str, PyTree] = {}
-        after = []
-        # Fusions of the estimates, through their quantizers.
-        for fusion, state in zip(self.fusions, quantizer_states, strict=True):
-            following, outcome, traffic = fusion.step(state, estimates, k)
-            after.append(following)
-            fused |= outcome
-            uplinks |= traffic
-        # Informed centres, which propagate the joint moments of the errors.
-        learned = []
-        for centre, state in zip(self.centres, centre_states, strict=True):
-            following, outcome = self._centred(centre, state, filter_states, z, estimates, u, k)
-            learned.append(following)
-            fused |= outcome
-        # Centres with reports over uplinks.
-        published: dict[str, PyTree] = {}
-        reports: dict[str, PyTree] = {}
-        for name, link in self.reporting.items():
-            happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
-            published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
-            uplinks |= {name: traffic} if traffic else {}
-        # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
-        for name, mesh in sorted(self.meshes.items()):
-            happens = mesh.edges.lossless() if drawn is None else drawn[name]  # within a process nothing is lost
-            flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
-            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
-            estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
+        # Fusions of the nodes' estimates.
+        estimates = tuple(single.estimate for _, single in stepped)
+        following, outputs = self._fused(
+            (filter_states, quantizer_states, centre_states, reporting), z, estimates, u, k, drawn or {}
+        )
+        fused = outputs["fused"] = {name: single.estimate for name, (_, single) in received.items()} | outputs["fused"]
         # Tests of fused estimates, by what arrived after the last of them.
         distances = {
             name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
             for name, test in self.tests.items()
         }
         tested = {name: following_prior(fused[name]) for name in self.tests}
-        # Next states and results.
-        filter_states = tuple(state for state, _ in stepped)
-        central = {name: state for name, (state, _) in received.items()}
-        following = filter_states, central, tuple(after), tuple(learned), published, tested
-        outputs: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
-        if self.smooths:
-            outputs["smoother_steps"] = tuple(single.steps for _, single in stepped)
-            outputs["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
             outputs["tested"] = distances
-            outputs["judged"] = tuple(single.judgement for _, single in stepped)
-            outputs["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
-            outputs["weighed"] = tuple(single.weighed for _, single in stepped)
-            outputs["weighed_centrally"] = {name: single.weighed for name, (_, single) in received.items()}
-        return following, outputs
+        for field, of_nodes, centrally in self._details():
+            outputs[of_nodes] = tuple(getattr(single, field) for _, single in stepped)
+            outputs[centrally] = {name: getattr(single, field) for name, (_, single) in received.items()}
+        # Next states.
+        central = {name: state for name, (state, _) in received.items()}
+        return (tuple(state for state, _ in stepped), central, *following, tested), outputs
+
+    def _details(self) -> list[tuple[str, str, str]]:
+        """Further fields of each filter's step, with their names among the outputs: of nodes, of central filters."""
+        judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
+        steps = [("steps", "smoother_steps", "central_steps")]
+        return steps * self.smooths + judged * self.judges
+
+    def _fused(
+        self,
+        states: tuple[PyTree, ...],
+        z: Sequence[jax.Array],
+        estimates: tuple[Estimate, ...],
+        u: jax.Array,
+        k: jax.Array,
+        drawn: Mapping[str, PyTree],
+    ) -> tuple[tuple[PyTree, ...], dict[str, PyTree]]:
+        """Step all fusions of the nodes' estimates, whose filters had these states before.
+
+        Returns the next states of quantizers, centres and reports, and the outputs that every step has.
+        """
+        filter_states, quantizer_states, centre_states, reporting = states
+        fused, uplinks, reports, published = (dict[str, PyTree]() for _ in range(4))
+        # Rules, through their quantizers.
+        after, learned = list[PyTree](), list[PyTree]()
+        for fusion, state in zip(self.fusions, quantizer_states, strict=True):
+            following, outcome, traffic = fusion.step(state, estimates, k)
+            after.append(following)
+            fused |= outcome
+            uplinks |= traffic
+        # Informed centres, which propagate the joint moments of the errors.
+        for centre, state in zip(self.centres, centre_states, strict=True):
+            following, outcome = self._centred(centre, state, filter_states, z, estimates, u, k)
+            learned.append(following)
+            fused |= outcome
+        # Centres with reports over uplinks.
+        for name, link in self.reporting.items():
+            happens = drawn[name] if name in drawn else link.uplinks.undrawn()
+            published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
+            uplinks |= {name: traffic} if traffic else {}
+        # Fusions between neighbours: estimates of each node, after those of the filters, in the order of their names.
+        for name, mesh in sorted(self.meshes.items()):
+            happens = drawn[name] if name in drawn else mesh.edges.lossless()  # within a process nothing is lost
+            flags, ahead = happens if isinstance(happens, tuple) else (happens, ())
+            published[name], shown = mesh.step(reporting[name], z, jnp.asarray(flags), u, k, ahead)
+            estimates, reports[name] = (*estimates, *shown), (flags, jnp.zeros(()))
+        outputs = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
+        return (tuple(after), tuple(learned), published), outputs
 
     def _centred(
         self,

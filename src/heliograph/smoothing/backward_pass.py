@@ -140,7 +140,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
         earlier = jax.vmap(lambda step, *rest: step.back(*rest))(here, later, before.mean, before.covariance)
         moments = jax.vmap(lambda step, *rest: step.before(*rest))(here, before, earlier, known)
         both: tuple[PyTree, Moments] = jax.tree.map(
-            lambda a, b: jnp.where(_column(ahead <= last, a), a, b), (earlier, moments), carry
+            lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), (earlier, moments), carry
         )
         return both
 
@@ -177,7 +177,3 @@ def rows_of(steps: T, which: slice | jax.Array) -> T:
     """Return some steps of what is stacked along time."""
     chosen: T = jax.tree.map(lambda leaf: leaf[which], steps)
     return chosen
-
-
-def _column(marks: jax.Array, like: jax.Array) -> jax.Array:
-    return marks.reshape(-1, *[1] * (like.ndim - 1))

@@ -12,11 +12,11 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.loop import serve_until
 from heliograph.serving.message import Message
 from heliograph.serving.output import Output
+from heliograph.serving.running import connected
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import InMemoryStore, identity

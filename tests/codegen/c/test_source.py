@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.c_source import CSource, literal
-from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import scalars
 from heliograph.codegen.memory import InMemory
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.export.measure import COMPILER, FLAGS
 from tests.export.device import needs_compiler

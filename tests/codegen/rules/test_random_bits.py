@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliograph.codegen.folding import DTYPES, EVALUATED
-from heliograph.codegen.graph import Node, Unsupported
 from heliograph.codegen.lowering import scalars
+from heliograph.codegen.nodes import Node, Unsupported
 from heliograph.codegen.program import lower
 from heliograph.codegen.rules.random_bits import hash_function, hashed
 from tests.codegen.compiled import WIDTH, engine_of

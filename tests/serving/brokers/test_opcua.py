@@ -15,8 +15,8 @@ from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.listening import listen
 from heliograph.serving.brokers.opcua import OF_RANGE, Reporting, read_reporting, reporting_of
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import connected
 from heliograph.serving.brokers.url import address
+from heliograph.serving.running import connected
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph_studies.live.server import free_port

@@ -22,8 +22,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 import heliograph as hg
 from heliograph import cli
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import connected
 from heliograph.serving.message import Message
+from heliograph.serving.running import connected
 from heliograph_studies.live.server import Server, free_port
 from tests.serving.broker_servers import KINDS, at, running
 

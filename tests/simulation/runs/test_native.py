@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.codegen.engine import SETTING
-from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.nodes import Unsupported
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of

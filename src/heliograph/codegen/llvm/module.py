@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.llvm.operations import BITS
-from heliograph.codegen.llvm.slots import Slots, loops_of
-from heliograph.codegen.llvm.text import Writer
+from heliograph.codegen.llvm.text import Slots, Writer, loops_of
 from heliograph.codegen.llvm.transposed import mover
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.nodes import Buffer, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, varying
 from heliograph.codegen.rules.loops import copied
 from heliograph.codegen.rules.random_bits import hash_function

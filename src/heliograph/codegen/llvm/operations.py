@@ -7,7 +7,7 @@ of a result depend neither on the width nor on the level of optimisation.
 import struct
 from collections.abc import Callable
 
-from heliograph.codegen.graph import Node, Type, Unsupported
+from heliograph.codegen.nodes import Node, Type, Unsupported
 from heliograph.codegen.vectors.elementary import FUNCTIONS, SCALAR
 
 LLVM = {"f64": "double", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Block, Guard, Key, Node
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, array_of, like
 from heliograph.codegen.memory import LONG, InMemory
+from heliograph.codegen.nodes import Block, Guard, Key, Node
 from heliograph.codegen.rules.elementwise import select
 from heliograph.codegen.rules.loops import in_memory, repeated, size_of
 from heliograph.codegen.rules.shapes import FEW

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
+from heliograph.codegen.nodes import Unsupported
 
 LARGEST = 8  # rows: of larger ones the straight line is long, and the library's method faster
 SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Graph, Key, Node, Type, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from heliograph.codegen.nodes import Key, Node, Type, Unsupported
 
 # Operation of JAX -> the graph's.
 ELEMENTWISE = {name: name for name in (

@@ -7,9 +7,9 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
-from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import RULES, Lowering, Rule, known_integers
 from heliograph.codegen.memory import contiguous
+from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.rules.loops import in_memory
 from heliograph.codegen.rules.shapes import FEW, chosen
 from heliograph.codegen.rules.views import clamped

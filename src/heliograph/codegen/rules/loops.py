@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of, scalars
 from heliograph.codegen.memory import InMemory
+from heliograph.codegen.nodes import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
 from heliograph.codegen.rules.elementwise import select
 
 WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Graph, Node, Type, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+from heliograph.codegen.nodes import Node, Type, Unsupported
 
 
 def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:

@@ -14,8 +14,9 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Graph, Key, Node, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, array_of, keys_of, result_shape
+from heliograph.codegen.nodes import Key, Node, Unsupported
 from heliograph.codegen.rules.elementwise import broadcast
 
 Word = Any  # of 32 bits, in an integer or an array of wider ones

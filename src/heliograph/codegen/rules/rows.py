@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Node, Unsupported
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
 from heliograph.codegen.memory import LARGE, LONG, InMemory
+from heliograph.codegen.nodes import Node, Unsupported
 from heliograph.codegen.rules.elementwise import ELEMENTWISE
 from heliograph.codegen.rules.loops import in_memory, repeated
 

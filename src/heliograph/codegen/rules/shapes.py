@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Graph, Node, Unsupported
+from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape
+from heliograph.codegen.nodes import Node, Unsupported
 
 FEW = 16  # places that a number found in the data may choose among, one comparison each
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Buffer, Key, Node
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
 from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.nodes import Buffer, Key, Node
 from heliograph.codegen.rules.elementwise import PASSED_ON
 from heliograph.codegen.rules.loops import copied, in_memory, repeated
 from heliograph.codegen.rules.shapes import FEW

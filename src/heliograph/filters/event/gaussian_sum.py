@@ -316,7 +316,7 @@ class EventFilter(AbstractSizedFilter):
         stays = before.keep(np.r_[0:size])
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
-        return _chosen(forbidden, stays, parts)
+        return Parts(*(jnp.where(forbidden, x, y) for x, y in zip(stays, parts, strict=True)))
 
     @in_float64
     def estimate(self, state: EventBelief) -> Estimate:
@@ -331,10 +331,6 @@ class EventFilter(AbstractSizedFilter):
         """Mean and covariance of the state by the whole sum."""
         n, whole = len(self.states), join(state.parts)
         return Belief(whole.mean[0, :n], whole.covariance[0, :n, :n])
-
-
-def _chosen(first: jax.Array, a: Parts, b: Parts) -> Parts:
-    return Parts(*(jnp.where(first, x, y) for x, y in zip(a, b, strict=True)))
 
 
 def _sent(label: jax.Array, lost: bool) -> jax.Array:

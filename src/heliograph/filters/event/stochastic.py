@@ -102,16 +102,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         posteriors, weight, innovation = receive(belief, sent, channel, jnp.arange(modes), state.law, values, size)
         came = join(Parts(safe_log(weight), posteriors.mean, posteriors.covariance, jnp.eye(len(weight))[:, None]))
 
-        # Nothing: the link was down, and the prior stays; or the sender was silent.
-        lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
         log_silent, quiet = self._silence(prior, signal, state.reference, k)
-        parts = [_alone(log_silent, quiet, state.law).labelled(0, state.law[None] * (1 - lost))]
-        if self.loses:
-            parts.append(_alone(jnp.zeros(()), prior, state.law).labelled(0, state.law[None] * lost))
-        if len(down):
-            up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
-            parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
-        nothing = join(together(parts))
+        nothing = self._nothing(prior, _alone(log_silent, quiet, state.law), state.law, channel, down)
 
         there = jnp.any(~jnp.isnan(values))
         log_nothing = jnp.maximum(nothing.log_weight[0], np.log(FLOOR))  # of what the rule forbids
@@ -135,6 +127,19 @@ class StochasticEventFilter(AbstractSizedFilter):
             value = jnp.append(value, known)
         following = state._replace(mean=after.mean[0], covariance=after.covariance[0], law=after.label[0, 0])
         return following, Innovation(value, covariance, total)
+
+    def _nothing(
+        self, prior: Belief, silent: Parts, law: jax.Array, channel: SideInformation, down: jax.Array
+    ) -> Parts:
+        """Belief where nothing came: the sender was silent, or the link was down, and the prior stays."""
+        lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
+        parts = [silent.labelled(0, law[None] * (1 - lost))]
+        if self.loses:
+            parts.append(_alone(jnp.zeros(()), prior, law).labelled(0, law[None] * lost))
+        if len(down):
+            up = jnp.where(down[0] > 0, -jnp.inf, 0.0)
+            parts = [parts[0].times(up), *(cause.times(jnp.where(down[0] > 0, 0.0, -jnp.inf)) for cause in parts[1:])]
+        return join(together(parts))
 
     def _link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Mean gain (m, p) and spread (m, m, p + 1, p + 1) of the link where all of what was sent arrives."""

@@ -21,7 +21,7 @@ from heliograph.filters.gaussian.correction import (
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Series
+from heliograph.random_affine.combine import GainAndNoise, opened
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.moments.second_moments import (
     QuadraticMap,
@@ -37,8 +37,8 @@ class AbstractUpdate(Module):
     """Rule for bounding the effect of a channel's uncertainty, with the gain that minimises the bound."""
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Return the channel's mean gain and its worst cases, computed once before any data."""
-        raise NotImplementedError
+        """Return the channel's mean gain and its worst cases over the polytope of laws, once before any data."""
+        return second_order(channel)
 
     def described(self) -> "AbstractUpdate":
         """Return the update that corrects once the channel is described.
@@ -77,10 +77,6 @@ class Polytope(AbstractUpdate):
     def __init__(self, scalars: Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases over the polytope of possible laws."""
-        return second_order(channel)
-
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
@@ -109,10 +105,6 @@ class ZeroMean(AbstractUpdate):
         self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
-
-    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases over the polytope of possible laws."""
-        return second_order(channel)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
@@ -187,7 +179,7 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     `variance` is the bound on var g of a hop.
     """
-    hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
+    hops = [_hop_range(hop) for hop in opened(channel)]
     # The recursion over the hops.
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:

@@ -1,6 +1,7 @@
 """Filter for laws of finite support: every combination of gains and noises, then one Gaussian by moment matching."""
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import above_products, cholesky, psd_solve, symmetrize, with_rounding
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine, fold, memories
 from heliograph.random_affine.chain import Autoregression
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
@@ -47,38 +48,34 @@ class Component(NamedTuple):
     noise: np.ndarray
 
 
+Atoms = list[list[Component]]  # of each of the maps inside
+
+
 def atoms_of(channel: AbstractRandomAffine) -> list[Component]:
     """All combinations of the atoms of a map's gains and noises."""
-    match channel:
-        # z = g H y + n: every gain with every noise.
-        case GainAndNoise():
-            gains, noises = _gain_atoms(channel.law), _noise_atoms(channel.noise)
-            atoms = [Component(p * q, g * np.asarray(channel.matrix), c, r) for p, g in gains for q, c, r in noises]
-        # One map after another: G_2 (G_1 y + n_1) + n_2.
-        case Series():
-            atoms = atoms_of(channel.maps[0])
-            for affine in channel.maps[1:]:
-                atoms = _combine(atoms, atoms_of(affine), _after)
-        # Maps of the same signal, stacked.
-        case Stack():
-            atoms = atoms_of(channel.maps[0])
-            for affine in channel.maps[1:]:
-                atoms = _combine(atoms, atoms_of(affine), _others)
+    return fold(channel, {
+        GainAndNoise: _atoms_of_hop,
+        Series: _combined(_after),
+        Stack: _combined(_others),
         # One of several maps, drawn: p(i) times the atoms of map i.
-        case Mixture():
-            weighted = zip(channel.choice.probabilities, channel.maps, strict=True)
-            atoms = [c._replace(weight=p * c.weight) for p, affine in weighted for c in atoms_of(affine)]
-        case _:
-            raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(channel).__name__)
-    return atoms
+        Mixture: lambda mixture, parts: [c._replace(weight=p * c.weight) for p, atoms in
+                                         zip(mixture.choice.probabilities, parts, strict=True) for c in atoms],
+    }, "mixture filter", "maps made of hops, series, stacks and mixtures")  # fmt: skip
 
 
-def _combine(
-    a: list[Component], b: list[Component], join: Callable[[Component, Component], Component]
-) -> list[Component]:
-    if len(a) * len(b) > COMPONENT_LIMIT:
-        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
-    return [join(x, y) for x in a for y in b]
+def _atoms_of_hop(hop: GainAndNoise, _: object) -> list[Component]:
+    """Every gain with every noise of z = g H y + n."""
+    gains, noises = _gain_atoms(hop.law), _noise_atoms(hop.noise)
+    return [Component(p * q, g * np.asarray(hop.matrix), c, r) for p, g in gains for q, c, r in noises]
+
+
+def _combined(join: Callable[[Component, Component], Component]) -> Callable[[object, Atoms], list[Component]]:
+    def pairs(a: list[Component], b: list[Component]) -> list[Component]:
+        if len(a) * len(b) > COMPONENT_LIMIT:
+            raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
+        return [join(x, y) for x in a for y in b]
+
+    return lambda _, parts: reduce(pairs, parts)
 
 
 def _after(x: Component, y: Component) -> Component:
@@ -281,7 +278,8 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
             the last digit. A combination of atoms that leaves z without randomness, as a link that is off does, counts
             where z agrees with it to this resolution, and only there.
 
-    Claim: "nominal".
+    Claim: "nominal". With next to no noise in plant and link the one Gaussian after each step may leave out the true
+        mode: squared errors were 1e11 times the claim.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a gain that drifts, parts that do not fit, a law with no

@@ -4,7 +4,7 @@ Each uses the Markov chain, updates through each mode's map with a Gaussian upda
 They differ in when Gaussians are merged; all reduce a mixture to two moments, so that no claim is exact.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -240,37 +240,18 @@ def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Ar
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
-def link_by_mode(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, nodes: int
-) -> tuple[AbstractPlant, Angles, Array, SideInformation | OverTime]:
-    """Return the plant at the start, received angles, the modes' initial law, and the channel by mode.
-
-    A gain that drifts has `nodes` modes.
-    """
+def by_mode(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None, nodes: int
+) -> dict[str, Any]:
+    """Return the fields that filters behind a channel with modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
-    return start, received_angles(plant, sensor, channel), *describe_modes(channel, nodes)
-
-
-def _build(
-    plant: AnyPlant,
-    sensor: AnySensor,
-    channel: Channel,
-    merging: AbstractMerging,
-    transform: AbstractTransform | None,
-    nodes: int,
-) -> MultipleModelFilter:
-    start, angles, initial, described = link_by_mode(plant, sensor, channel, nodes)
-    return MultipleModelFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
-        initial=initial,
-        merging=merging,
-        transform=Cubature() if transform is None else transform,
-        observed_angles=angles,
+    angles, (initial, described) = received_angles(plant, sensor, channel), describe_modes(channel, nodes)
+    return {
+        "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "observed_angles": angles,
+        "transform": Cubature() if transform is None else transform,
         **sized("nominal", start, first(channel).outputs),
-    )
+    }  # fmt: skip
 
 
 def imm_filter(
@@ -289,14 +270,15 @@ def imm_filter(
         transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
-    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps.
+    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps. With next to no
+    noise in plant and link the merged Gaussian may leave out the true mode: squared errors were 1e11 times the claim.
 
     Raises:
         ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
 
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
-    return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)
+    return MultipleModelFilter(merging=MergeByNextMode(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
 def gpb1_filter(
@@ -314,13 +296,14 @@ def gpb1_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal", and too small where fading is slow: the correlation of state and mode is dropped at each step.
+    With next to no noise it may leave out the true mode, as `imm_filter`.
 
     Raises:
         ValueError: as for `imm_filter`.
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970).
     """
-    return _build(plant, sensor, channel, MergeAll(), transform, nodes)
+    return MultipleModelFilter(merging=MergeAll(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
 def gpb2_filter(
@@ -336,11 +319,12 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, as for the others.
+    many modes it is too small, as for the others. With next to no noise in plant and link squared errors were 17 times
+    the claim.
 
     Raises:
         ValueError: as for `imm_filter`.
 
     Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
     """
-    return _build(plant, sensor, channel, MergeByMode(), transform, nodes)
+    return MultipleModelFilter(merging=MergeByMode(), **by_mode(plant, sensor, channel, transform, nodes))

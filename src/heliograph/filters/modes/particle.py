@@ -6,12 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.precise import initial_size
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.multiple_model import link_by_mode, merged, receive, together
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.modes.multiple_model import by_mode, merged, receive, together
 from heliograph.filters.modes.side_information import SideInformation
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
@@ -155,15 +155,8 @@ def particle_filter(
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
         2001.
     """
-    start, angles, initial, described = link_by_mode(plant, sensor, channel, nodes)
     return ParticleFilter(
-        plant=plant,
-        sensor=sensor,
-        channel=described,
-        initial=initial,
-        transform=Cubature() if transform is None else transform,
-        observed_angles=angles,
         particles=check_count("particles", particles),
         seed=check_count("seed", seed, 0),
-        **sized("nominal", start, first(channel).outputs),
+        **by_mode(plant, sensor, channel, transform, nodes),
     )

@@ -24,7 +24,9 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
         return logs.reshape(-1)
     if domain.kind == "covariance":
         factor = _factor(name, value)
-        return np.asarray(np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[_lower(value)])
+        return np.asarray(
+            np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[np.tril_indices(len(value))]
+        )
     if np.any(value <= domain.low) or np.any(value >= domain.high):
         raise fail(f"start of {name}", f"a start {_between(domain)}", value.tolist())
     return np.asarray(link(domain, value)).reshape(-1)
@@ -92,10 +94,6 @@ def size(domain: Domain, shape: tuple[int, ...]) -> int:
     if domain.kind == "simplex":
         return count - count // shape[-1]
     return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
-
-
-def _lower(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.tril_indices(len(value))
 
 
 def _factor(name: str, value: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from heliograph.planning.moments import check_design_plant, measurement_moment, 
 from heliograph.planning.paths.model import Paths, Plants
 from heliograph.planning.transmitters import sent_powers, transmits
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Stack, opened
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -74,42 +74,33 @@ def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], pr
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
     """
-    match channel:
-        case GainAndNoise() if not transmits(channel):  # a wire passes each number on
-            return [Chain(row, {}) for row in np.asarray(channel.matrix) @ rows]
-        # a stack holds chains; a series is a chain once its wires are multiplied out
-        case Stack():
-            parts = enumerate(channel.maps, 1)
-            return [chain for i, affine in parts for chain in chains_of(affine, rows, f"{prefix}part{i}.")]
-        case Series():
-            head, *rest = channel.maps
-            if isinstance(head, GainAndNoise) and not transmits(head) and rest:
-                onward = rest[0] if len(rest) == 1 else Series(rest)
-                combined = np.asarray(head.matrix) @ rows
-                combined[:, -1] += np.asarray(head.noise.mean)
-                return chains_of(onward, combined, prefix)
-            if isinstance(head, Series):
-                return chains_of(Series([*head.maps, *rest]), rows, prefix)
-            if isinstance(head, Stack):
-                raise _unfit("a stack that is sent on")
-    return [_chain(channel, rows, prefix)]
+    head, *rest = opened(channel)
+    # Wires multiply what is carried.
+    while isinstance(head, GainAndNoise) and not transmits(head):
+        rows = np.asarray(head.matrix) @ rows
+        if not rest:
+            return [Chain(row, {}) for row in rows]
+        rows[:, -1] += np.asarray(head.noise.mean)
+        head, *rest = rest
+    if not isinstance(head, Stack):
+        return [_chain([head, *rest], rows, prefix)]
+    if rest:
+        raise _unfit("a stack that is sent on")
+    parts = enumerate(head.maps, 1)
+    return [chain for i, affine in parts for chain in chains_of(affine, rows, f"{prefix}part{i}.")]
 
 
-def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
-    if channel.outputs != 1:
-        raise _unfit(f"one gain for {channel.outputs} numbers")
-    parts = list(channel.maps) if isinstance(channel, Series) else [channel]
+def _chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
+    if parts[-1].outputs != 1:
+        raise _unfit(f"one gain for {parts[-1].outputs} numbers")
     row, fading, moved = rows[0], 1.0, False
     hops: dict[str, tuple[float, float]] = {}
     while parts:
         affine = parts.pop(0)
-        # Series and losses are opened; an unobserved loss is fading.
-        if isinstance(affine, Series):
-            parts = [*affine.maps, *parts]
-            continue
+        # An unobserved loss is fading.
         if isinstance(affine, Mixture):
             inner, lost = _loss(affine)
-            parts, fading = [inner, *parts], fading * lost
+            parts, fading = [*opened(inner), *parts], fading * lost
             continue
         if not isinstance(affine, GainAndNoise):
             raise _unfit(type(affine).__name__)

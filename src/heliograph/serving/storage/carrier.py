@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant_codec import HEAD, plant_bytes, plant_from
+from heliograph.live.plant_codec import PlantParts, plant_bytes, plant_from
 from heliograph.live.rows import BEFORE
 from heliograph.live.snapshot import Identity
 from heliograph.numerics.check import fail
@@ -127,52 +127,37 @@ class Carrier:
 
     def _translated(self, body: bytes) -> bytes:
         """Return a plant's bytes with the columns, places of nodes and counts of this network; rows not stepped."""
-        old, pool = self._old, self.fleet.pool
+        old = self._old
         names, names_here = list(old["nodes"]), list(self.fleet.network.names)
         same = [name for name in names if old["nodes"][name] == dict(self._sizes()).get(name)]
         new_index = {i: names_here.index(name) for i, name in enumerate(names) if name in same} | {-1: -1}
-        # Parts of the bytes, as `plant_bytes` writes them.
-        length, count, events, numbers = HEAD.unpack_from(body)
-        head, at = json.loads(body[HEAD.size : HEAD.size + length]), HEAD.size + length
-        whole = np.frombuffer(body, "<i8", 2 * count + 3 * events, at)
-        at += whole.nbytes
         received = sum(old["nodes"].values())
-        width = old["state"] + old["outputs"] + 2 * old["given"] + received + 2
-        table = np.frombuffer(body, "<f8", count * width, at).reshape(count, width)
-        at += table.nbytes
-        times, values = np.frombuffer(body, "<f8", events, at), np.frombuffer(body, "<f8", numbers, at + 8 * events)
+        parts = PlantParts.of(body, old["state"] + old["outputs"] + 2 * old["given"] + received + 2)
         # Rows, the base first, in the order of their keys; a row of a node that is gone goes with it.
-        keys = whole[: 2 * count].reshape(count, 2)
         joint = self.fleet.rows_are_joint
         rows = [
-            (float(table[i, -1]), int(a) if joint or a == BEFORE else new_index.get(int(a), BEFORE), int(b), i)
-            for i, (a, b) in enumerate(keys)
+            (float(parts.table[i, -1]), int(a) if joint or a == BEFORE else new_index.get(int(a), BEFORE), int(b), i)
+            for i, (a, b) in enumerate(parts.keys)
             if i == 0 or joint or int(a) in new_index
         ]
         rows = [rows[0], *sorted(rows[1:])]
         number = {row[-1]: i for i, row in enumerate(rows)}
-        new = np.stack([self._row(table[row[-1]], new_index, names) for row in rows])
+        table = np.stack([self._row(parts.table[row[-1]], new_index, names) for row in rows])
+        assert table.shape[1] == self.fleet.pool.table.shape[1]
         # Events, in the order of their rows.
-        ends = np.cumsum([self._size(names, int(p)) for p in whole[2 * count + 1 :: 3]])
-        parts = np.split(values, ends[:-1]) if events else []
-        triples = whole[2 * count :].reshape(events, 3)
-        stay = [i for i, (row, p, _) in enumerate(triples) if int(p) in new_index and int(row) in number]
-        events_left = [(number[int(triples[i, 0])], new_index[int(triples[i, 1])], int(triples[i, 2])) for i in stay]
-        integers = [x for row in rows for x in row[1:3]] + [x for event in events_left for x in event]
-        data = np.concatenate([np.zeros(0), *(parts[i] for i in stay)])
-        head["links"] = {name: link for name, link in head["links"].items() if name in (*same, "inputs")}
-        text = json.dumps(head).encode()
-        assert new.shape[1] == pool.table.shape[1]
-        return b"".join(
-            [
-                HEAD.pack(len(text), len(rows), len(stay), len(data)),
-                text,
-                np.array(integers, dtype="<i8").tobytes(),
-                new.astype("<f8").tobytes(),
-                times[stay].astype("<f8").tobytes(),
-                data.astype("<f8").tobytes(),
-            ]
-        )
+        ends = np.cumsum([self._size(names, int(node)) for _, node, _ in parts.events])
+        values = np.split(parts.values, ends[:-1]) if len(parts.events) else []
+        stay = [i for i, (row, p, _) in enumerate(parts.events) if int(p) in new_index and int(row) in number]
+        events = [(number[int(row)], new_index[int(p)], int(count)) for row, p, count in parts.events[stay]]
+        links = {name: link for name, link in parts.head["links"].items() if name in (*same, "inputs")}
+        return PlantParts(
+            head=parts.head | {"links": links},
+            keys=np.array([row[1:3] for row in rows]),
+            events=np.array(events, dtype=np.int64),
+            table=table,
+            times=parts.times[stay],
+            values=np.concatenate([np.zeros(0), *(values[i] for i in stay)]),
+        ).to_bytes()
 
     def _sizes(self) -> Iterator[tuple[str, int]]:
         return ((name, node.received) for name, node in self.fleet.network.nodes.items())

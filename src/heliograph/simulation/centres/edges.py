@@ -1,6 +1,7 @@
 """Edges between neighbours: a channel each, of which only matters what arrives."""
 
 from collections.abc import Mapping, Sequence
+from types import UnionType
 
 import equinox as eqx
 import jax
@@ -13,9 +14,9 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance, of_each
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.numerics.traced import library, plain
+from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
+from heliograph.random_affine.base import AbstractRandomAffine, held_maps
 from heliograph.random_affine.delay import Delayed, sent
 from heliograph.random_affine.erasure import Erasure, arrived
 from heliograph.random_affine.modes import Modes
@@ -145,9 +146,8 @@ def check_edge(what: str, link: Channel) -> None:
         late = late_part(step)
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
-        inside = _without_losses(step)
-        inside = inside if late is None else _without_losses(late.link)
-        for mode in map(_without_losses, inside.maps if isinstance(inside, Modes) else [inside]):
+        inside = _opened(step, Erasure | Delayed)[1]
+        for mode in (_opened(m)[1] for m in (inside.maps if isinstance(inside, Modes) else [inside])):
             if mode.remembers or mode.past or not _is_perfect(mode):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail(what, expected, type(first(link)).__name__)
@@ -155,25 +155,25 @@ def check_edge(what: str, link: Channel) -> None:
 
 def late_part(channel: AbstractRandomAffine) -> Delayed | None:
     """Return the delay of a link, whose messages may also be lost; None of one without."""
-    inside = _without_losses(channel)
+    inside = _opened(channel)[1]
     return inside if isinstance(inside, Delayed) else None
 
 
-def _without_losses(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the link for messages that are not lost."""
-    while isinstance(channel, Erasure):
-        channel = channel.base
-    return channel
+def _opened(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
+    """Return the link for messages that are not lost, inside all maps of these kinds, and how probable they are."""
+    arrival: Scalar = 1.0
+    while isinstance(channel, kinds):
+        arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
+        channel = held_maps(channel)[0]
+    return arrival, channel
 
 
 def arrival_chance(channel: Channel | None) -> float | None:
     """Probability that a message arrives; None where it is not the same at every step whatever was before."""
-    chance = 1.0
-    while isinstance(channel, Erasure):
-        chance *= float(channel.arrival)
-        channel = channel.base
-    steady = channel is None or not (isinstance(channel, OverTime) or channel.erases)
-    return chance if steady else None
+    if channel is None or isinstance(channel, OverTime):
+        return 1.0 if channel is None else None
+    chance, inside = _opened(channel)
+    return None if inside.erases else float(chance)
 
 
 def loss_rate(channel: Channel | None) -> float | None:
@@ -181,18 +181,16 @@ def loss_rate(channel: Channel | None) -> float | None:
 
     Of modes with losses l and transitions P the spectral radius of diag(l) P; without modes the probability of a loss.
     """
-    arrival = 1.0
-    while isinstance(channel, Erasure | Delayed):
-        arrival *= float(channel.arrival) if isinstance(channel, Erasure) else 1.0
-        channel = channel.base if isinstance(channel, Erasure) else channel.link
-    if not isinstance(channel, Modes):
-        chance = arrival_chance(channel)
-        return None if chance is None else 1 - arrival * chance
-    chances = [arrival_chance(mode) for mode in channel.maps]
-    if channel.memory.name is not None or None in chances:
+    if channel is None or isinstance(channel, OverTime):
+        return 0.0 if channel is None else None
+    arrival, inside = _opened(channel, Erasure | Delayed)
+    if not isinstance(inside, Modes):
+        return None if inside.erases else 1 - float(arrival)
+    chances = [arrival_chance(mode) for mode in inside.maps]
+    if inside.memory.name is not None or None in chances:
         return None
-    losses = 1 - arrival * np.array(chances, dtype=float)
-    return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(channel.memory.transition))).max())
+    losses = 1 - float(arrival) * np.array(chances, dtype=float)
+    return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(inside.memory.transition))).max())
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:

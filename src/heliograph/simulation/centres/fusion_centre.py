@@ -1,8 +1,10 @@
 """Fusion centre as a filter: its measurements are the nodes' reports, and it propagates the moments of their errors."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,9 +18,24 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
+from heliograph.simulation.centres.centre import Centre
 
-if TYPE_CHECKING:
-    from heliograph.simulation.stepping import AllFilters
+
+class NodesFilters(Protocol):
+    """The nodes' filters as their centre steps them: without data, on which their gains do not depend."""
+
+    @property
+    def informed(self) -> tuple[Centre, ...]:
+        """The centre of their errors' moments, alone."""
+
+    def init(self) -> PyTree:
+        """States before the first step."""
+
+    def matrices(self, centre: Centre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
+        """Matrices of the filters' next step."""
+
+    def followed(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """States after a step."""
 
 
 class CentreState(NamedTuple):
@@ -37,7 +54,7 @@ class CentreFilter(AbstractSizedFilter):
     gains depend on none.
     """
 
-    filters: "AllFilters"
+    filters: NodesFilters
     links: Links | OverTime
     rows: np.ndarray
     ages: int = eqx.field(static=True)

@@ -1,7 +1,6 @@
 """Checks of a fusion between neighbours when its network is made, and its claim."""
 
 import warnings
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,17 +20,14 @@ from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.centre import informed_claim
 from heliograph.simulation.centres.edges import arrival_chance, edge_links, edges_of, loss_rate
 from heliograph.simulation.centres.mesh_decay import check_decay
-from heliograph.simulation.node import Node
-
-if TYPE_CHECKING:
-    from heliograph.simulation.network import Network
+from heliograph.simulation.node import HasNodes, Node
 
 MODE = 1e-6  # below 1: a mode is computed to half of the digits where it is a double one
 CUTS, UNIT = 200, 1e5  # nodes whose losses are judged, and the digits of a loss's logarithm
 RANK = 1e-9  # relative: singular values of a mode's observability below are zero
 
 
-def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
+def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     """Refuse a fusion between neighbours that does not fit its network, by the name of the node that does not.
 
     Raises:
@@ -65,7 +61,7 @@ def check_mesh(name: str, fusion: Fusion, network: "Network") -> None:
     _check_fixed(what, fusion, network, graph)
 
 
-def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
+def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
@@ -82,7 +78,7 @@ def mesh_claim(name: str, fusion: Fusion, network: "Network") -> Claim:
     return known if fusion.rule.needs_joint else weakest([known, "upper"])
 
 
-def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
+def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
     """Refuse a rule without weights for neighbours, more than it can do, and a start that has no inverse."""
     rule, kind = fusion.rule, type(fusion.rule)
     if not rule.between_neighbours:
@@ -104,7 +100,7 @@ def _check_rule(what: str, fusion: Fusion, network: "Network") -> None:
         raise fail(f"{what} by {kind.__name__}", "a regular initial covariance of the plant", "a singular one")
 
 
-def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+def _check_messages(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Refuse links that do not serve, and delays and quantizers where no bound is known then."""
     past, kind = edges_of(fusion, graph).past, type(fusion.rule).__name__
     if not past and fusion.quantizer is None:
@@ -122,7 +118,7 @@ def _check_messages(what: str, fusion: Fusion, network: "Network", graph: Graph)
                      "was sent and lost before (UniformQuantizer)")  # fmt: skip
 
 
-def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> None:
+def _check_seen(what: str, name: str, fusion: Fusion, network: HasNodes) -> None:
     """Refuse every node for which an unstable mode is seen by nobody upstream; warn of stable ones.
 
     Mode lambda is seen where rank [lambda I - A; H of all upstream] = n, itself included.
@@ -164,7 +160,7 @@ def _check_seen(what: str, name: str, fusion: Fusion, network: "Network") -> Non
                       "are those of its prior", stacklevel=4)  # fmt: skip
 
 
-def _check_losses(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Refuse a node whose error grows whatever the rule, since messages from those that see a mode are lost too often.
 
     Of nodes that do not see the mode lambda, |lambda|^2 p < 1: p is the product of the loss rates of all edges into
@@ -237,7 +233,7 @@ def _check_regular(where: str, noise: np.ndarray) -> None:
         raise fail(where, "measurement noise in every direction", "a singular covariance")
 
 
-def _check_fixed(what: str, fusion: Fusion, network: "Network", graph: Graph) -> None:
+def _check_fixed(what: str, fusion: Fusion, network: HasNodes, graph: Graph) -> None:
     """Refuse fixed shares with which errors grow, where the plant does not decay and gains become steady."""
     plant, link, names = network.plant, fusion.link, graph.nodes
     if not isinstance(fusion.rule, DiffusionWeights) or not isinstance(plant, LinearPlant) or len(names) > CUTS:

@@ -15,6 +15,7 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predict
 from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.quantizer import AbstractQuantizer
+from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -117,14 +118,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
             whose steps are of any length.
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
-    what = f"node {node!r} of fusion {fusion!r} by itself"
-    if between.rule.needs_joint:
-        raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
-                   type(between.rule).__name__)  # fmt: skip
-    if between.rounds > 1 or between.alpha is not None:
-        raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
-    if "dt" in network.inputs:
-        raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
+    _check_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
     # The node's row of the graph: itself, then its neighbours.
     graph, neighbours = graph_of(between.neighbours or {}, nodes), between.neighbours or {}
     i, count = nodes.index(node), 1 + len(neighbours[node])
@@ -157,6 +151,17 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         inputs=network.inputs,
         received=sizes[0] + sum(_numbers(len(network.states), size) for size in sizes[1:]),
     )
+
+
+def _check_alone(what: str, network: Network, between: Fusion) -> None:
+    """Raise ValueError where a node cannot filter without knowledge of all others."""
+    if between.rule.needs_joint:
+        raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
+                   type(between.rule).__name__)  # fmt: skip
+    if between.rounds > 1 or between.alpha is not None:
+        raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
+    if "dt" in network.inputs:
+        raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
 
 
 def node_network(network: Network, node: str) -> Network:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
@@ -11,11 +11,8 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
 from heliograph.random_affine.base import memories
 from heliograph.simulation.description.links import ARROW, link_in_words
-from heliograph.simulation.node import Node
+from heliograph.simulation.node import HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
-
-if TYPE_CHECKING:
-    from heliograph.simulation.network import Network
 
 NAMED = 3  # of many nodes that are alike, how many are named
 
@@ -27,7 +24,7 @@ class Part(NamedTuple):
     words: str
 
 
-def diagram(network: "Network") -> list[Part]:
+def diagram(network: HasNodes) -> list[Part]:
     """Return the parts of a network in the order in which data flow."""
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
@@ -49,7 +46,7 @@ def diagram(network: "Network") -> list[Part]:
     return [Part(visible(line.name), visible(line.words)) for line in parts]
 
 
-def _node(network: "Network", name: str) -> str:
+def _node(network: HasNodes, name: str) -> str:
     """Return what a node receives, through which hops, and its filters with their claims."""
     node, claims = network.nodes[name], network.claims()[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
@@ -66,7 +63,7 @@ def _senders(relays: RelayNetwork | None, name: str) -> str:
     return listed(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
 
 
-def shared(network: "Network") -> list[str]:
+def shared(network: HasNodes) -> list[str]:
     """Return what several nodes share, in words: a common channel, or the memory of their links."""
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
@@ -89,12 +86,12 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(names[:NAMED])} … ({len(names)})"
 
 
-def text_of(network: "Network") -> str:
+def text_of(network: HasNodes) -> str:
     """Return the whole diagram as lines of text."""
     return "\n".join(_lines(network))
 
 
-def short_text_of(network: "Network") -> str:
+def short_text_of(network: HasNodes) -> str:
     """Return the diagram in as many and as long lines as any object is shown in; … stands for what is left out."""
     lines = _lines(network)
     left = len(lines) - LINES
@@ -102,17 +99,17 @@ def short_text_of(network: "Network") -> str:
     return "\n".join(cut(line) for line in lines)
 
 
-def _lines(network: "Network") -> list[str]:
+def _lines(network: HasNodes) -> list[str]:
     parts = diagram(network)
     width = max(len(line.name) for line in parts)
     return [_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
 
 
-def _title(network: "Network") -> str:
+def _title(network: HasNodes) -> str:
     return f"Network of {len(network.nodes)} node{'s' * (len(network.nodes) > 1)}"
 
 
-def table_of(network: "Network") -> str:
+def table_of(network: HasNodes) -> str:
     """Return the diagram as an HTML table, for notebooks."""
     rows = (
         f'<tr><th style="text-align:left">{escape(line.name)}</th>'

@@ -5,13 +5,12 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.traced import is_traced
-from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine
+from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
-from heliograph.random_affine.noise import AbstractNoise
 
 ARROW, DIRECT = " → ", "direct"
 
@@ -27,38 +26,32 @@ def link_in_words(channel: Channel) -> str:
 
 def _words(channel: AbstractRandomAffine) -> str:
     """Return a map in words; nothing for one that only selects components."""
-    match channel:
+    in_words: str = fold(channel, {
         # One case for each way of making a channel.
-        case GainAndNoise():
-            return _hop(channel)
-        case Series():
-            return ARROW.join(filter(None, map(_words, channel.maps)))
-        case Stack():
-            parts = [_words(affine) or DIRECT for affine in channel.maps]
-            same = len(set(parts)) == 1
-            return f"{len(parts)} × ({parts[0]})" if same else f"({' | '.join(parts)})"
-        case Erasure():
-            return f"{_words(channel.base) or DIRECT}, {_percent(1 - channel.arrival)} lost"
-        case Mixture():
-            return _mixture(channel)
+        GainAndNoise: lambda hop, _: _hop(hop),
+        Series: lambda _, parts: ARROW.join(filter(None, parts)),
+        Stack: lambda _, parts: _stack([words or DIRECT for words in parts]),
+        Erasure: lambda loss, parts: f"{parts[0] or DIRECT}, {_percent(1 - loss.arrival)} lost",
+        Mixture: lambda mixture, parts: _mixture(mixture, [words or DIRECT for words in parts]),
         # Links that deliver late, and those whose modes remember.
-        case Delayed():
-            late = "/".join(map(str, channel.times))
-            stamped = ", timestamped" if channel.timestamped else ""
-            return f"{_words(channel.link) or DIRECT}, {late} steps late{stamped}"
-        case OfLine():
-            return _words(channel.plain)
-        case Modes():
-            alternatives = " or ".join(_words(affine) or DIRECT for affine in channel.maps)
-            return f"{_memory(channel)}modes ({alternatives})"
-        case Faded():
-            return f"{_memory(channel)}drifting hop"
-    return type(channel).__name__
+        Delayed: lambda late, parts: f"{parts[0] or DIRECT}, {'/'.join(map(str, late.times))} steps late"
+                                     f"{', timestamped' if late.timestamped else ''}",
+        OfLine: lambda _, parts: parts[0],
+        Modes: lambda modes, parts: f"{_memory(modes)}modes ({' or '.join(words or DIRECT for words in parts)})",
+        Faded: lambda faded, _: f"{_memory(faded)}drifting hop",
+        AbstractRandomAffine: lambda other, _: type(other).__name__,
+    })  # fmt: skip
+    return in_words
+
+
+def _stack(parts: list[str]) -> str:
+    return f"{len(parts)} × ({parts[0]})" if len(set(parts)) == 1 else f"({' | '.join(parts)})"
 
 
 def _hop(hop: GainAndNoise) -> str:
     """Return one hop in words by its law, its gain where that is one known number, and whether it adds noise."""
-    matrix, silent = np.asarray(hop.matrix), _no_noise(hop.noise)
+    matrix = np.asarray(hop.matrix)
+    silent = not (np.any(np.asarray(hop.noise.covariance)) or np.any(np.asarray(hop.noise.mean)))
     if not matrix.any():
         return "nothing sent"
     diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
@@ -72,13 +65,9 @@ def _hop(hop: GainAndNoise) -> str:
     return f"{kind} {gain:.3g}" if diagonal and gain != 1 else kind
 
 
-def _no_noise(noise: AbstractNoise) -> bool:
-    return not np.any(np.asarray(noise.covariance)) and not np.any(np.asarray(noise.mean))
-
-
-def _mixture(channel: Mixture) -> str:
+def _mixture(channel: Mixture, parts: list[str]) -> str:
     """Return a mixture in words; of a channel and silence, as a loss that nobody notices."""
-    shares, parts = channel.choice.probabilities, [_words(affine) or DIRECT for affine in channel.maps]
+    shares = channel.choice.probabilities
     if len(parts) == 2 and parts[1] == "nothing sent":
         return f"{parts[0]}, {_percent(shares[1])} lost unnoticed"
     return f"({' or '.join(f'{words} ({_percent(p)})' for words, p in zip(parts, shares, strict=True))})"

@@ -1,7 +1,7 @@
 """Labelled arrays and wide tables: the common parts of records and of statistics."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from heliograph.simulation.centres.uplinks import Uplink
-    from heliograph.simulation.results.record import Record
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
@@ -24,28 +23,28 @@ COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRE
 SENT = ("saturated", "symbols")
 
 
-def record_frame(record: "Record") -> "pd.DataFrame":
-    """Table of a record: a row for each time, or run and time; columns (node, filter, quantity, component, other)."""
+def record_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
+    """Table of a record's fields: a row for each time, or run and time; columns as in LEVELS."""
     import pandas as pd
 
     # Columns: truth, measurements, estimates, uplinks.
     columns: dict[Column, np.ndarray] = {}
-    if record.truth is not None:
-        columns |= {("", "", "truth", s, ""): record.truth[..., i] for i, s in enumerate(record.states)}
-    for node, z in record.measurements.items():
+    if fields["truth"] is not None:
+        columns |= {("", "", "truth", s, ""): fields["truth"][..., i] for i, s in enumerate(fields["states"])}
+    for node, z in fields["measurements"].items():
         columns |= {(node, "", "measurement", f"z{i}", ""): z[..., i] for i in range(z.shape[-1])}
-    for node, filters in record.estimates.items():
+    for node, filters in fields["estimates"].items():
         for name, estimate in filters.items():
-            columns |= _of_estimate(node, name, estimate, record.states)
-    for name, uplink in record.uplinks.items():
+            columns |= _of_estimate(node, name, estimate, fields["states"])
+    for name, uplink in fields["uplinks"].items():
         for i, node in enumerate(uplink.nodes):
             for quantity in SENT:
                 values = getattr(uplink, quantity)
-                columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(record.states)}
+                columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(fields["states"])}
     # Rows: runs one after another.
-    index = pd.Index(record.time, name="time")
-    if record.runs is not None:
-        index = pd.MultiIndex.from_product([range(record.runs), index], names=["run", "time"])
+    index = pd.Index(fields["time"], name="time")
+    if runs is not None:
+        index = pd.MultiIndex.from_product([range(runs), index], names=["run", "time"])
     frame = pd.DataFrame({i: values.reshape(-1) for i, values in enumerate(columns.values())}, index=index)
     frame.columns = _labels(list(columns))
     return frame
@@ -63,42 +62,34 @@ def record_fields(frame: "pd.DataFrame") -> dict[str, Any]:
     runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
     steps = len(frame) // (runs or 1)
     lead = (steps,) if runs is None else (runs, steps)
-    parts: dict[tuple[str, str, str], dict[tuple[str, str], np.ndarray]] = {}
-    for i, (node, name, quantity, component, other) in enumerate(frame.columns):
-        values = frame.iloc[:, i].to_numpy().reshape(lead)
-        parts.setdefault((node, name, quantity), {})[component, other] = values
-    joined = {key: np.stack(list(columns.values()), axis=-1) for key, columns in parts.items()}
-    # Sort them into truth, measurements, estimates and uplinks.
-    states: tuple[str, ...] = ()
-    measurements: dict[str, np.ndarray] = {}
-    estimates: dict[str, dict[str, Estimate]] = {}
-    sent: dict[str, dict[str, list[np.ndarray]]] = {}
-    for (node, name, quantity), values in joined.items():
-        if quantity in ("truth", "mean"):
-            states = tuple(component for component, _ in parts[node, name, quantity])
-        # Columns of one node, of one uplink, or of one covariance.
-        elif quantity == "measurement":
-            measurements[node] = values
-            estimates.setdefault(node, {})
-        elif quantity in SENT:
-            sent.setdefault(name, {}).setdefault(node, []).append(values)
-        else:
-            n, mean = len(states), joined[node, name, "mean"]
-            covariance = values.reshape(*lead, n, n)
-            estimates.setdefault(node, {})[name] = Estimate(mean, covariance, COVARIANCE[quantity])
-    # Uplinks with their nodes side by side.
-    uplinks = {
-        name: Uplink(tuple(by_node), *(np.stack(arrays, axis=-2) for arrays in zip(*by_node.values(), strict=True)))
-        for name, by_node in sent.items()
-    }
-    time = np.asarray(frame.index.get_level_values("time"))[:steps]
+    columns: dict[tuple[str, str, str], list[int]] = {}
+    for i, column in enumerate(frame.columns):
+        columns.setdefault(column[:3], []).append(i)
+    values = {key: frame.iloc[:, which].to_numpy().reshape(*lead, -1) for key, which in columns.items()}
+    # States as the truth, else the first mean, has them.
+    named = next((which for (_, _, quantity), which in columns.items() if quantity in ("truth", "mean")), [])
+    states = tuple(frame.columns[i][3] for i in named)
+    measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}
+    estimates: dict[str, dict[str, Estimate]] = {node: {} for node in measurements}
+    uplinks: dict[str, list[str]] = {}
+    for (node, name, quantity), value in values.items():
+        if quantity in COVARIANCE:
+            covariance = value.reshape(*lead, len(states), len(states))
+            moments = values[node, name, "mean"], covariance
+            estimates.setdefault(node, {})[name] = Estimate(*moments, COVARIANCE[quantity])
+        elif quantity == SENT[0]:
+            uplinks.setdefault(name, []).append(node)
     return {
-        "time": time,
+        "time": np.asarray(frame.index.get_level_values("time"))[:steps],
         "states": states,
-        "truth": joined.get(("", "", "truth")),
+        "truth": values.get(("", "", "truth")),
         "measurements": measurements,
         "estimates": estimates,
-        "uplinks": uplinks,
+        # Uplinks with their nodes side by side.
+        "uplinks": {
+            name: Uplink(tuple(nodes), *(np.stack([values[n, name, q] for n in nodes], axis=-2) for q in SENT))
+            for name, nodes in uplinks.items()
+        },
     }
 
 
@@ -122,7 +113,9 @@ def _of_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]
 
 TIME = "time"
 Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
-Part = tuple[tuple[int, ...], np.ndarray]  # where an array belongs, and the array
+T = TypeVar("T")
+Shape = tuple[int, ...]
+Placed = tuple[Shape, T]  # where a value belongs, and the value
 MEANING = {
     "truth": "true state",
     "measurement": "what reached the node, NaN where nothing arrived and beyond its length",
@@ -160,7 +153,15 @@ def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, 
     return {name: unit for name, unit in known.items() if unit}
 
 
-def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...], parts: Sequence[Part]) -> np.ndarray:
+def placed(nodes: Sequence[str], by_node: Mapping[str, Mapping[str, T]]) -> tuple[list[str], list[Placed[T]]]:
+    """Names of all filters, and each filter's value with its place among nodes and filters."""
+    filters = list(dict.fromkeys(name for of in by_node.values() for name in of))
+    places: list[Placed[T]] = [((nodes.index(node), filters.index(name)), value)
+              for node, of in by_node.items() for name, value in of.items()]  # fmt: skip
+    return filters, places
+
+
+def filled(lead: Shape, places: Shape, tail: Shape, parts: Sequence[Placed[np.ndarray]]) -> np.ndarray:
     """Arrays (*lead, *up to tail) at their places along axes between; NaN elsewhere."""
     arrays = np.full((*lead, *places, *tail), np.nan)
     ahead: tuple[slice, ...] = (slice(None),) * len(lead)
@@ -170,7 +171,7 @@ def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...]
     return arrays
 
 
-def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
+def claims_of(sizes: Shape, outcome: Iterable[Placed[Any]]) -> np.ndarray:
     """Claim of each filter, at its place; empty elsewhere."""
     claims = np.full(sizes, "", dtype="U7")
     for position, estimate in outcome:

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.disk.quoting import in_figure
 from heliograph.filters.innovation import InnovationSummary, Weighed, summarise_innovations
 from heliograph.model.estimate import Claim, Estimate, is_sound
 from heliograph.numerics.check import check_count, fail
@@ -24,6 +25,7 @@ from heliograph.simulation.results.labelled import (
     dataset_of,
     filled,
     names_of,
+    placed,
     record_fields,
     record_frame,
     units_of,
@@ -31,7 +33,14 @@ from heliograph.simulation.results.labelled import (
     uplinks_from,
     values_of,
 )
-from heliograph.simulation.results.plots import plot_record
+from heliograph.simulation.results.plots import (
+    chosen_filters,
+    colour_of,
+    legend_outside,
+    panels,
+    state_places,
+    with_unit,
+)
 from heliograph.simulation.results.saved import Saved
 
 if TYPE_CHECKING:  # extras
@@ -191,15 +200,9 @@ class Record(Saved):
             ModuleNotFoundError: without xarray (extra "results").
         """
         nodes = list(dict.fromkeys([*self.measurements, *self.estimates]))
-        filters = list(dict.fromkeys(name for estimate in self.estimates.values() for name in estimate))
+        filters, results = placed(nodes, self.estimates)
         lead, axes = (*([] if self.runs is None else [self.runs]), len(self.time)), [] if self.runs is None else ["run"]
         n, sizes = len(self.states), (len(nodes), len(filters))
-        # Estimates and measurements with their places.
-        results = [
-            ((nodes.index(node), filters.index(name)), estimate)
-            for node, by_name in self.estimates.items()
-            for name, estimate in by_name.items()
-        ]
         received = [((nodes.index(node),), z) for node, z in self.measurements.items()]
         most = max((z.shape[-1] for _, z in received), default=0)
         # Variables, NaN where a node has no such filter or component.
@@ -264,7 +267,7 @@ class Record(Saved):
         Raises:
             ModuleNotFoundError: without pandas (extra "results").
         """
-        return record_frame(self)
+        return record_frame(vars(self), self.runs)
 
     @classmethod
     def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
@@ -302,7 +305,28 @@ class Record(Saved):
             ValueError: a node, filter, state or run that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        return plot_record(self, node, filters, states, axes, run, sigmas)
+        # What is drawn, on which axes.
+        node, filters = chosen_filters(self.estimates, node, filters)
+        places = state_places(states, self.states)
+        if self.runs is not None and check_count("run", run, 0) >= self.runs:
+            raise fail("run", f"one of {self.runs}, counted from 0", run)
+        which: Any = ... if self.runs is None else run
+        drawn = panels(axes, len(places), self.time, self.units)
+        # Mean and +- sigmas claimed deviations, then the truth.
+        for panel, i in zip(drawn, places, strict=True):
+            for number, name in enumerate(filters):
+                estimate, colour = self.estimates[node][name], colour_of(number)
+                mean = np.asarray(estimate.mean)[which][..., i]
+                variance = np.asarray(estimate.covariance)[which][..., i, i]
+                panel.plot(self.time, mean, color=colour, label=in_figure(name))
+                if estimate.claim != "none":
+                    band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
+                    panel.fill_between(self.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+            if self.truth is not None:
+                panel.plot(self.time, self.truth[which][..., i], color="0.25", linestyle=":", label="truth")
+            panel.set_ylabel(with_unit(self.states[i], self.units))
+        legend_outside(drawn[0])
+        return drawn
 
     def failures(self) -> list[str]:
         """List filters whose estimate became non-finite or whose bound lost positive semidefiniteness, a line each.

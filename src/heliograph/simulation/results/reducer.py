@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeVar
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
@@ -23,7 +24,7 @@ from heliograph.simulation.results.by_name import (
 )
 from heliograph.simulation.results.record import Record
 
-Result = TypeVar("Result")
+Result = TypeVar("Result", default=Record)  # of the reducer; a record where there is none
 
 
 @readable

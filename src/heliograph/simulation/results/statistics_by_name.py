@@ -1,15 +1,16 @@
 """Error statistics by node and filter."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from heliograph.disk.quoting import in_figure
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import units_in
+from heliograph.numerics.types import ArrayLike, units_in
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.labelled import (
     TIME,
@@ -19,12 +20,21 @@ from heliograph.simulation.results.labelled import (
     dataset_of,
     filled,
     names_of,
+    placed,
     units_of,
     uplink_variables,
     uplinks_from,
     values_of,
 )
-from heliograph.simulation.results.plots import plot_statistics
+from heliograph.simulation.results.plots import (
+    FAR,
+    chosen_filters,
+    colour_of,
+    legend_outside,
+    panels,
+    state_places,
+    with_unit,
+)
 from heliograph.simulation.results.saved import Saved
 from heliograph.simulation.results.statistics import ErrorStatistics, matrices
 
@@ -65,48 +75,42 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         Raises:
             ModuleNotFoundError: without xarray (extra "results").
         """
-        # Statistics with their places.
         nodes = list(self)
-        filters = list(dict.fromkeys(name for by_name in self.values() for name in by_name))
-        every = [
-            ((nodes.index(node), filters.index(name)), single)
-            for node, by_name in self.items()
-            for name, single in by_name.items()
-        ]
+        filters, every = placed(nodes, self)
         if not every:
             raise fail("statistics", "those of one filter at least", "none")
         sizes, n, first = (len(nodes), len(filters)), len(self.states), every[0][1]
-        batch, steps = (len(first.count), first.nees.shape[1]), first.nees.shape[1]
+        batch, over = (len(first.count), first.nees.shape[1]), (first.nees.shape[1],)
 
-        def of(name: str) -> np.ndarray:
-            """Return sums of pairs i <= j as symmetric matrices."""
-            return filled(batch, sizes, (n, n), [(at, matrices(getattr(s, name))) for at, s in every])
+        def of(
+            lead: tuple[int, ...], tail: tuple[int, ...], value: Callable[[ErrorStatistics], ArrayLike]
+        ) -> np.ndarray:
+            """Return a value of each filter's statistics, at its place."""
+            return filled(lead, sizes, tail, [(position, np.asarray(value(score))) for position, score in every])
 
-        # Figures over time: squared errors, claimed variances, NEES, failures.
-        squares = [(position, np.diagonal(score.actual(), axis1=-2, axis2=-1)) for position, score in every]
-        claimed = [(at, np.diagonal(s.claimed(), axis1=-2, axis2=-1)) for at, s in every]
-        sums = [(at, s.nees) for at, s in every]
-        distances = [(at, s.nees.sum(axis=0) / s.runs / n) for at, s in every]
-        by_step = [(at, np.full(steps, np.nan) if s.failed is None else s.failed) for at, s in every]
-        failed = [(at, np.array(s.failed_runs)) for at, s in every]
-        filters_of = ["node", "filter"]
+        def variances(matrices: np.ndarray) -> np.ndarray:
+            return np.diagonal(matrices, axis1=-2, axis2=-1)
+
+        by_filter = ["node", "filter"]
         uplinks = {name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink}
         # Sums by batch, from which the statistics can be restored, then figures.
+        claimed = of(over, (n,), lambda s: variances(s.claimed()))
         variables = {
             "runs": (["batch"], first.count),
-            "errors": (["batch", TIME, *filters_of, "state", "other"], of("pairs")),
-            "claimed": (["batch", TIME, *filters_of, "state", "other"], of("claimed_pairs")),
-            "nees": (["batch", TIME, *filters_of], filled(batch, sizes, (), sums)),
-            "claim": (filters_of, claims_of(sizes, every)),
-            "failed": ([TIME, *filters_of], filled((steps,), sizes, (), by_step)),
-            "failed_runs": (filters_of, filled((), sizes, (), failed)),
-            "rmse": ([TIME, *filters_of, "state"], np.sqrt(filled((steps,), sizes, (n,), squares))),
-            "deviation": ([TIME, *filters_of, "state"], _root(filled((steps,), sizes, (n,), claimed))),
-            "nees_per_dimension": ([TIME, *filters_of], filled((steps,), sizes, (), distances)),
+            "errors": (["batch", TIME, *by_filter, "state", "other"], of(batch, (n, n), lambda s: matrices(s.pairs))),
+            "claimed": (["batch", TIME, *by_filter, "state", "other"],
+                        of(batch, (n, n), lambda s: matrices(s.claimed_pairs))),
+            "nees": (["batch", TIME, *by_filter], of(batch, (), lambda s: s.nees)),
+            "claim": (by_filter, claims_of(sizes, every)),
+            "failed": ([TIME, *by_filter], of(over, (), lambda s: np.nan if s.failed is None else s.failed)),
+            "failed_runs": (by_filter, of((), (), lambda s: s.failed_runs)),
+            "rmse": ([TIME, *by_filter, "state"], np.sqrt(of(over, (n,), lambda s: variances(s.actual())))),
+            "deviation": ([TIME, *by_filter, "state"], np.sqrt(np.where(claimed >= 0, claimed, np.nan))),
+            "nees_per_dimension": ([TIME, *by_filter], of(over, (), lambda s: s.nees.sum(axis=0) / s.runs / n)),
             **uplink_variables(uplinks, [TIME], n),
         }  # fmt: skip
         labels = {"node": nodes, "filter": filters, "state": self.states, "other": self.states}
-        time = np.arange(1.0, steps + 1)
+        time = np.arange(1.0, over[0] + 1)
         return dataset_of(STATISTICS, variables, labels, time, self.units, claims_text(self))
 
     @classmethod
@@ -183,7 +187,25 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             ValueError: a node, filter or state that there is not, another number of axes.
             ModuleNotFoundError: without matplotlib (extra "report").
         """
-        return plot_statistics(self, node, filters, states, axes)
+        # What is drawn, on which axes.
+        node, filters = chosen_filters(self, node, filters)
+        places = state_places(states, self.states)
+        time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
+        drawn = panels(axes, len(places), time, self.units)
+        for panel, i in zip(drawn, places, strict=True):
+            for number, name in enumerate(filters):
+                # Solid: actual; dashed: claimed.
+                score, colour = self[node][name], colour_of(number)
+                claimed = score.claimed()[:, i, i]
+                panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=in_figure(name))
+                panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+            panel.set_ylabel(f"RMSE of {with_unit(self.states[i], self.units)}")
+            # A log axis where one is far larger than another.
+            ends = [float(np.sqrt(self[node][name].actual()[-1, i, i])) for name in filters]
+            if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
+                panel.set_yscale("log")
+        legend_outside(drawn[0], "dashed: claimed")
+        return drawn
 
     def failures(self) -> list[str]:
         """List filters without a valid estimate in some run, a line each, as for a record.
@@ -221,7 +243,3 @@ def _summary(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, ob
     for state, single, spread, claimed in by_state:
         total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
     return total
-
-
-def _root(variance: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.where(variance >= 0, variance, np.nan))

@@ -40,7 +40,7 @@ def trajectories(
         results = advance(*carry, keys, *jax.tree.leaves(row))
         return results[: len(example_carry)], results[len(example_carry) :]
 
-    begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
+    begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if s and not v else leaf
              for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
     outcome = jax.lax.scan(scanned, begin, rows)[1]
     # The axis of runs first again.
@@ -110,7 +110,3 @@ def _unchanging(following: Callable[[list[bool]], list[bool]], marks: list[bool]
 
 def _axes(varies: Sequence[bool]) -> list[int | None]:
     return [-1 if v else None for v in varies]
-
-
-def _with_runs(leaf: jax.Array, runs: int) -> jax.Array:
-    return jnp.broadcast_to(leaf[..., None], (*leaf.shape, runs))

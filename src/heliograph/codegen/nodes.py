@@ -1,0 +1,164 @@
+"""Nodes of a program: scalar operations in blocks, loops and guarded blocks between them, and arrays in memory."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+Type = Literal["f64", "bool", "i32", "i64", "u32", "u64"]
+TYPES: dict[str, Type] = {
+    "float64": "f64",
+    "bool": "bool",
+    "int32": "i32",
+    "int64": "i64",
+    "uint32": "u32",
+    "uint64": "u64",
+}
+Number = float | int | bool
+
+
+class Unsupported(Exception):  # noqa: N818
+    """Error of a program that is not supported: the operation, and its place in the program."""
+
+    def __init__(self, operation: str, where: str = ""):
+        super().__init__(f"{operation}{f' at {where}' if where else ''}")
+        self.operation, self.where = operation, where
+
+
+class Node:
+    """One scalar operation on some nodes.
+
+    `value` has what is known at compile time: a constant's number, a parameter's or result's (loop, index), a load's
+    (buffer, offset, strides). `serial` counts nodes in the order in which they were made.
+    """
+
+    __slots__ = ("args", "block", "op", "serial", "type", "value")
+
+    def __init__(self, op: str, type: Type, args: tuple["Node", ...], block: "Block", value: Any, serial: int):
+        self.op, self.type, self.args, self.block, self.value, self.serial = op, type, args, block, value, serial
+
+    def __repr__(self) -> str:
+        if self.op == "constant":
+            return str(self.value)
+        return f"%{self.serial}={self.op}({', '.join(f'%{a.serial}' for a in self.args)})"
+
+
+class Key:
+    """A key of random numbers: its two words, of type u32."""
+
+    __slots__ = ("first", "second")
+
+    def __init__(self, first: Node, second: Node):
+        self.first, self.second = first, second
+
+
+class Block:
+    """Operations and statements in order; they may use nodes of the enclosing blocks.
+
+    `owner`: the loop or guard of the block. `pinned`: nodes made here stay here, since they are computed only where a
+    run needs them.
+    """
+
+    __slots__ = ("depth", "items", "owner", "parent", "pinned", "seen")
+
+    def __init__(self, parent: "Block | None", pinned: bool = False):
+        self.parent, self.pinned = parent, pinned
+        self.owner: Loop | Guard | None = None
+        self.depth: int = 0 if parent is None else parent.depth + 1
+        self.items: list[Node | Loop | Guard | Store | Check] = []
+        self.seen: dict[Any, Node] = {}
+
+    def inwards(self) -> Iterator["Block"]:
+        """Yield this block and the enclosing ones, outermost last."""
+        block: Block | None = self
+        while block is not None:
+            yield block
+            block = block.parent
+
+
+class Buffer:
+    """Numbers in memory, `size` of each run; a table has the same numbers in all runs.
+
+    `kind`: "input", "scratch" or "table". A buffer that the program fills is read after the statement of `block` that
+    fills it. A buffer `inside` another starts at a place of it.
+    """
+
+    __slots__ = ("block", "inside", "kind", "parts", "shape", "stores", "table", "type")
+
+    def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
+        self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
+        self.stores: list[Store] = []
+        self.inside: tuple[Buffer, int] | None = None
+        self.parts: list[Buffer] = []
+
+    def take_in(self, inner: "Buffer", start: int) -> None:
+        """Place another buffer inside this one, from an offset on."""
+        inner.inside = self, start
+        self.parts.append(inner)
+
+    @property
+    def owner(self) -> "tuple[Buffer, int]":
+        """Return the buffer whose memory this one uses, and the offset in it."""
+        if self.inside is None:
+            return self, 0
+        whole, start = self.inside[0].owner
+        return whole, start + self.inside[1]
+
+    @property
+    def size(self) -> int:
+        """Return the count of numbers of one run."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+class Store:
+    """buffer[offset + sum strides * indices] = node."""
+
+    __slots__ = ("block", "buffer", "indices", "node", "offset", "strides")
+
+    def __init__(
+        self, block: Block, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]
+    ):
+        self.block, self.buffer, self.node, self.offset = block, buffer, node, offset
+        self.strides, self.indices = tuple(strides), tuple(indices)
+
+
+class Loop:
+    """A body that is repeated: `length` times, or while any run's condition holds (then `length` is None).
+
+    `parameters` stand for the carry in the body, `initial` and `following` for the carry before and after a turn,
+    `results` for the carry after the last one. `counter` counts the turns from 0. `block` is the enclosing block.
+    """
+
+    __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
+
+    def __init__(self, body: Block, length: int | None, initial: Sequence[Node]):
+        self.body, self.length, self.initial = body, length, list(initial)
+        self.block: Block = body.parent  # type: ignore[assignment]
+        body.owner = self
+        self.parameters: list[Node] = []
+        self.following: list[Node] = []
+        self.results: list[Node] = []
+        self.condition: Node | None = None
+        self.counter: Node | None = None
+
+
+class Check:
+    """Exit of a loop, at this place of its body, unless some run's condition holds."""
+
+    __slots__ = ("loop",)
+
+    def __init__(self, loop: Loop):
+        self.loop = loop
+
+
+class Guard:
+    """A body that is computed only if `condition` holds for some run; `results` are its `values`, else zeros."""
+
+    __slots__ = ("block", "body", "condition", "results", "values")
+
+    def __init__(self, body: Block, condition: Node):
+        self.body, self.condition = body, condition
+        self.block: Block = body.parent  # type: ignore[assignment]
+        body.owner = self
+        self.values: list[Node] = []
+        self.results: list[Node] = []
