@@ -1,6 +1,5 @@
 """Files of events: one row for each received message, in any order, with names of nodes and possibly dates."""
 
-import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from heliograph.disk.whole_file import FORMATS
 from heliograph.files.event_table import SECOND, EventTable
 from heliograph.files.recording import write_estimates
 from heliograph.files.sources import Reading
+from heliograph.files.table import csv_header, csv_lines
 from heliograph.live.event import INPUTS, Event, whole
 from heliograph.live.recorded import play
 from heliograph.model.plant import TIME_STEP
@@ -148,11 +148,7 @@ def _header(path: Path) -> list[str]:
             return list(pq.ParquetFile(path).schema_arrow.names)
         except (ValueError, OSError):  # no such file: who reads it says so
             return []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return [name.strip() for name in next(csv.reader(file), [])]
-    except (csv.Error, UnicodeDecodeError):
-        return []
+    return csv_header(path)
 
 
 def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
@@ -169,11 +165,8 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
                     raise fail(f"{path}, row {at}, column {name!r}", "a number", f"text, {shown(cell)}")
         return results
     # CSV: all rows must have as many cells as the header.
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = [[cell.strip() for cell in line] for line in csv.reader(file, strict=True) if line]
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+    with csv_lines(path) as lines:
+        header, *rows = [[cell.strip() for cell in line] for line in lines]
     for number, row in enumerate(rows, 1):
         if len(row) != len(header):
             raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(row))

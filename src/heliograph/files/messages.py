@@ -1,6 +1,5 @@
 """Messages of a recording, a bag or a CSV file of someone else's making, to events by the sources of a network."""
 
-import csv
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 from heliograph.files.bag import Progress, is_bag, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources import Sources, nanoseconds
+from heliograph.files.table import csv_header, csv_lines
 from heliograph.numerics.check import InputError, fail, file_path, instance, shown
 from heliograph.simulation.network import Network
 
@@ -48,15 +48,7 @@ def is_mapped(path: Path, sources: object) -> bool:
         return True
     if path.suffix.lower() != ".csv" or not isinstance(sources, Mapping) or not path.is_file():
         return False
-    return path.name in sources or TOPIC in _header(path)
-
-
-def _header(path: Path) -> list[str]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return next(csv.reader(file), [])
-    except (csv.Error, UnicodeDecodeError):
-        return []
+    return path.name in sources or TOPIC in csv_header(path)
 
 
 def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
@@ -85,17 +77,13 @@ def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the rows from 1, with numbers as numbers and empty cells as None."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = (line for line in csv.reader(file, strict=True) if line)
-            header = [name.strip() for name in next(lines, [])]
-            for number, line in enumerate(lines, 1):
-                if len(line) != len(header):
-                    raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
-                cells = [(name, cell.strip()) for name, cell in zip(header, line, strict=True)]
-                yield number, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+    with csv_lines(path) as lines:
+        header = [name.strip() for name in next(lines, [])]
+        for number, line in enumerate(lines, 1):
+            if len(line) != len(header):
+                raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
+            cells = [(name, cell.strip()) for name, cell in zip(header, line, strict=True)]
+            yield number, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
 
 
 def _cell(cell: str) -> float | int | str | None:

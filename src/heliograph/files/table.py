@@ -4,7 +4,8 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import check_output, format_of, whole_file
-from heliograph.numerics.check import fail, file_path, shown, table
+from heliograph.numerics.check import InputError, fail, file_path, shown, table
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 from heliograph.numerics.types import Shaped
 
@@ -136,16 +137,31 @@ def _check_distinct(path: Path, header: Sequence[str]) -> None:
         raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
-    # Cells as text; every row must have as many as the header.
+@contextmanager
+def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
+    """Lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = (line for line in csv.reader(file, strict=True) if line)
-            header = [from_cell(name.strip()) for name in next(lines, [])]
-            _check_header(path, header)
-            rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
+            yield (line for line in csv.reader(file, strict=True) if line)
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+
+
+def csv_header(path: Path) -> list[str]:
+    """Names of the columns of a CSV file; none of a file that is none."""
+    try:
+        with csv_lines(path) as lines:
+            return [name.strip() for name in next(lines, [])]
+    except InputError:
+        return []
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    # Cells as text; every row must have as many as the header.
+    with csv_lines(path) as lines:
+        header = [from_cell(name.strip()) for name in next(lines, [])]
+        _check_header(path, header)
+        rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
     # The first row decides which columns are dates; all others are numbers.
     dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
     numbers = [

@@ -217,10 +217,6 @@ def _cosine(a: Interval) -> Interval:
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 
-def _sine(a: Interval) -> Interval:
-    return _cosine(outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS))
-
-
 def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
     count = int(np.prod([a.low.shape[i] for i in axes]))
     size = np.sum(np.maximum(np.abs(a.low), np.abs(a.high)), axis=axes)
@@ -268,6 +264,6 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "tanh": _rising(np.tanh, -1.0, 1.0),
     "logistic": _rising(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
     "atan": _rising(np.arctan),
-    "sin": _sine,
+    "sin": lambda a: _cosine(outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
     "cos": _cosine,
 }

@@ -115,7 +115,8 @@ def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> 
             matrix, Independent(noises), center, Independent(laws), driven, states, plant.inputs, circular
         )
     # As functions; Gaussian laws are their covariances.
-    covariance = _diagonal([model.initial_covariance for model in models])
+    blocks = [model.initial_covariance for model in models]
+    covariance = scipy_for(blocks).linalg.block_diag(*blocks)
     start = covariance if all(model.deviation is None for model in models) else Independent(laws)
     return _by_functions(plant, bias, (coupling, pick), (center, start), (states, circular))
 
@@ -152,10 +153,6 @@ def _by_functions(
         return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
 
     return LinearPlant(matrix, spread, *start, driven, states, plant.inputs, circular)
-
-
-def _diagonal(blocks: list[Any]) -> Any:
-    return scipy_for(blocks).linalg.block_diag(*blocks)
 
 
 def _biased(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:

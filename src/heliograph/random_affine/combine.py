@@ -1,8 +1,9 @@
 """Maps made of maps: the atom, one random gain times a matrix plus noise; in series, mixed and stacked."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import product
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -338,22 +339,28 @@ class Stack(AbstractOfMaps):
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
         items = [m.moments(order) for m in self.maps]
         tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
-        rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
-        return Moments(stacked(rows), self.outputs, self.inputs, order)
+        return Moments(stacked(stack_rows(self, order, tables, multiply)), self.outputs, self.inputs, order)
 
-    def _row(self, powers: tuple[int, ...], tables: list[list[Matrix | None]]) -> Vector:
-        variables, start = self.inputs + 1, 0
-        coefficients: Vector = np.ones(1)
-        degree = 0
-        for m, table in zip(self.maps, tables, strict=True):
+
+def stack_rows(channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]) -> list[Any]:
+    """Return E[z^a | y] = prod_parts E[z_part^(a_part) | y] for each power a, as polynomials in y.
+
+    Args:
+        channel: the stack.
+        order: degree of the monomials of (z, 1).
+        tables: of each part and degree its polynomials (..., rows, columns); None of degree 0.
+        times: product of two polynomials, from (a, degree of a, b, degree of b, number of variables).
+    """
+    variables, rows = channel.inputs + 1, []
+    for powers in exponents(channel.outputs + 1, order):
+        polynomial, degree, start = np.ones(1), 0, 0
+        for m, table in zip(channel.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
-            start += m.outputs
-            k = sum(a)
-            rows = table[k]
-            if rows is not None:
-                polynomial = rows[position(m.outputs + 1, k)[(*a, 0)]]
-                coefficients, degree = multiply(coefficients, degree, polynomial, k, variables), degree + k
+            start, k = start + m.outputs, sum(a)
+            if k:
+                factor = table[k][..., position(m.outputs + 1, k)[(*a, 0)], :]
+                polynomial, degree = times(polynomial, degree, factor, k, variables), degree + k
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)
-        coefficients = multiply(coefficients, degree, constant, powers[-1], variables)
-        return coefficients
+        rows.append(times(polynomial, degree, constant, powers[-1], variables))
+    return rows

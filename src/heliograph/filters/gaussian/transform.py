@@ -50,7 +50,8 @@ class Cubature(AbstractTransform):
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Propagate the points and take their sample moments."""
         offsets, points = _cubature_points(mean, cholesky(covariance))
-        return _cubature_moments(offsets, jax.vmap(function, in_axes=1, out_axes=1)(points))
+        values = jax.vmap(function, in_axes=1, out_axes=1)(points)
+        return _about(offsets, values, _center(values))
 
 
 @runs_last
@@ -58,11 +59,6 @@ def _cubature_points(mean: jax.Array, factor: jax.Array) -> tuple[jax.Array, jax
     """Offsets sqrt(n) L (n, n), and the points mean + offsets, mean - offsets as columns (n, 2 n)."""
     offsets = mean.shape[0] ** 0.5 * factor
     return offsets, jnp.concatenate([mean[:, None] + offsets, mean[:, None] - offsets], axis=1)
-
-
-def _cubature_moments(offsets: jax.Array, values: jax.Array) -> Transformed:
-    """Sample moments of values (m, 2 n) in the order of the points."""
-    return _about(offsets, values, _center(values))
 
 
 @runs_last

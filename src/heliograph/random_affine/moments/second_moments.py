@@ -12,9 +12,9 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.traced import is_traced, library, placed, stacked
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, fold
-from heliograph.random_affine.combine import GainAndNoise, Series, Stack
+from heliograph.random_affine.combine import GainAndNoise, Series, Stack, stack_rows
 from heliograph.random_affine.law import Constant, Discrete
-from heliograph.random_affine.moments.monomials import Moments, count, exponents, position, product_table
+from heliograph.random_affine.moments.monomials import Moments, count, product_table
 
 CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
 
@@ -77,37 +77,20 @@ def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval
 
 def _stack_interval(channel: Stack, order: int) -> Interval:
     """Products of the parts' interval polynomials, row by row."""
-    variables = channel.inputs + 1
-    tables = [[moment_interval(m, k) if k else None for k in range(order + 1)] for m in channel.maps]
-    rows = []
-    for powers in exponents(channel.outputs + 1, order):
-        # Row z^a = prod_parts z_part^(a_part) times a power of the constant 1.
-        product: Interval = (np.ones(1), np.ones(1))
-        degree, start = 0, 0
-        for m, table in zip(channel.maps, tables, strict=True):
-            a = powers[start : start + m.outputs]
-            start, k = start + m.outputs, sum(a)
-            interval = table[k]
-            if interval is not None:
-                row = position(m.outputs + 1, k)[(*a, 0)]
-                product, degree = (
-                    _multiply_rows(product, degree, (interval[0][row], interval[1][row]), k, variables),
-                    degree + k,
-                )
-        # The constant's power is a column of its own.
-        constant = np.zeros(count(variables, powers[-1]))
-        constant[-1] = 1.0
-        rows.append(_multiply_rows(product, degree, (constant, constant), powers[-1], variables))
-    return stacked([r[0] for r in rows]), stacked([r[1] for r in rows])
+    tables = [[stacked(moment_interval(m, k)) if k else None for k in range(order + 1)] for m in channel.maps]
+    rows = stacked(stack_rows(channel, order, tables, _multiply_rows))
+    return rows[:, 0], rows[:, 1]
 
 
-def _multiply_rows(a: Interval, first: int, b: Interval, second: int, variables: int) -> Interval:
-    """Interval product of two polynomials: ends of the four products, summed over equal monomials."""
+def _multiply_rows(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
+    """Interval product of two polynomials: ends of the products of ends, summed over equal monomials.
+
+    Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
+    """
     table = product_table(variables, first, second)
     size = (count(variables, first + second),)
-    products = [x[:, None] * y for x in a for y in b]
-    ends = stacked(products)
-    return placed(size, table, ends.min(axis=0)), placed(size, table, ends.max(axis=0))
+    products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
+    return stacked([placed(size, table, products.min(axis=(0, 1))), placed(size, table, products.max(axis=(0, 1)))])
 
 
 PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples

@@ -235,9 +235,7 @@ class Store:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Commit plants, which must have the versions that they were read with, and outputs.
-
-        `published` is the number of the last output that was published, None if that has not changed.
+        """Commit plants and outputs in one transaction, as `StoreProtocol` says.
 
         Raises:
             ConflictError: another process has committed one of the plants.

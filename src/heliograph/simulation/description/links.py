@@ -11,7 +11,6 @@ from heliograph.random_affine.delay import Delayed, OfLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
-from heliograph.random_affine.noise import AbstractNoise
 
 ARROW, DIRECT = " → ", "direct"
 
@@ -51,7 +50,8 @@ def _stack(parts: list[str]) -> str:
 
 def _hop(hop: GainAndNoise) -> str:
     """Return one hop in words by its law, its gain where that is one known number, and whether it adds noise."""
-    matrix, silent = np.asarray(hop.matrix), _no_noise(hop.noise)
+    matrix = np.asarray(hop.matrix)
+    silent = not (np.any(np.asarray(hop.noise.covariance)) or np.any(np.asarray(hop.noise.mean)))
     if not matrix.any():
         return "nothing sent"
     diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
@@ -63,10 +63,6 @@ def _hop(hop: GainAndNoise) -> str:
         return ""
     kind = "known gain" if silent else "hop"
     return f"{kind} {gain:.3g}" if diagonal and gain != 1 else kind
-
-
-def _no_noise(noise: AbstractNoise) -> bool:
-    return not np.any(np.asarray(noise.covariance)) and not np.any(np.asarray(noise.mean))
 
 
 def _mixture(channel: Mixture, parts: list[str]) -> str:
