@@ -77,7 +77,7 @@ def test_no_absurd_value_is_learned_as_noise(value):
     """By the variance that it leaves behind itself a value is never far: it would hide all others for 4,000 steps."""
     stream = hg.Stream(hg.adaptive_filter(plain()))
     before = stream.push([0.3, -0.2])
-    with pytest.raises(ValueError, match="measurement of step 1: expected a plausible one, got .* deviations"):
+    with pytest.raises(ValueError, match=r"measurement of step 1: expected a plausible one, got .* deviations"):
         stream.push([value, 0.0])
     assert abs(stream.push([0.2, 0.1]).mean[0]) < 10 * np.sqrt(before.covariance[0, 0])
 
