@@ -246,3 +246,56 @@ def test_the_enumeration_finds_bounds_that_are_too_small():
     assert too_small(0.0, half)
     assert too_small(0.15, still)
     assert not too_small(0.0, lambda d: d) and not too_small(0.15, lambda d: d)
+
+
+BOUND = hg.Contaminated.at_most(1.0, 0.05, 100.0)  # of which only the covariance has a bound
+SCALAR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0), hg.hop(1.0, 0.1)
+WHERE = {
+    "plant": (hg.LinearPlant([[0.9]], BOUND, [0.0], 1.0), *SCALAR[1:]),
+    "sensor": (SCALAR[0], hg.LinearSensor([[1.0]], BOUND), SCALAR[2]),
+    "link": (*SCALAR[:2], hg.hop(1.0, BOUND)),
+}
+
+
+def chain(link):
+    return hg.gilbert_elliott(link, hg.hop(0.2, 0.05), 0.2, 0.2)
+
+
+def relayed(plant, sensor, link):
+    network = hg.model.RelayNetwork(
+        plant, sensor, ["r"], [{"r": {"sensor": link}, "receiver": {"r": hg.hop(1.0, 0.1)}}]
+    )
+    return hg.relays.receiver_behind_relays(network, hg.relays.local_error_design(network, 3).gains)
+
+
+EXACT = {
+    "linear": hg.linear_filter,
+    "cubature": hg.cubature_filter,
+    "fed back": hg.filters.fed_back_filter,
+    "first degree": lambda p, s, c: hg.polynomial_filter(p, s, c, 3, 1),
+    "informed": lambda p, s, c: hg.filters.side_information_filter(p, s, hg.erasure(c, 0.5)),
+    "informed of modes": lambda p, s, c: hg.filters.side_information_filter(p, s, chain(c)),
+    "mode known": lambda p, s, c: hg.filters.mode_known_filter(p, s, chain(c)),
+    "mode late": lambda p, s, c: hg.filters.mode_late_filter(p, s, chain(c)),
+    "late": lambda p, s, c: hg.linear_filter(p, s, hg.model.delayed(c, hg.Discrete([0, 1], [0.5, 0.5]))),
+    "by schedule": lambda p, s, c: hg.event_filter(p, s, c, hg.Periodic(2)),
+    "relayed": relayed,
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_noise_that_is_known_by_a_bound_makes_every_exact_claim_an_upper_bound(name):
+    assert EXACT[name](*SCALAR).claim == "exact"
+    assert [EXACT[name](*models).claim for models in WHERE.values()] == ["upper"] * 3
+
+
+def test_a_bound_of_the_covariance_is_none_of_higher_moments_nor_of_silence():
+    assert hg.filters.open_loop_filter(WHERE["plant"][0]).claim == "upper"
+    for plant, sensor, link in WHERE.values():
+        assert hg.polynomial_filter(plant, sensor, link, 3, 2).claim == "nominal"
+        assert hg.filters.memory_filter(plant, sensor, link, 3).claim == "nominal"
+        assert hg.event_filter(plant, sensor, link, hg.StochasticTrigger(1.0)).claim == "nominal"
+        nodes = {name: hg.Node(sensor, link, {"f": hg.linear_filter(plant, sensor, link)}) for name in "ab"}
+        rules = {"best": hg.fusion.MatrixWeights(), "reports": hg.fusion.AllReports()}
+        network = hg.Network(plant, nodes, {name: hg.Fusion("f", rule) for name, rule in rules.items()})
+        assert set(network.claims()["fused"].values()) == {"upper"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliograph.model.relays import RelayNetwork
-from heliograph.relays.design import given_design, local_error_design
+from heliograph.relays.design import given_design, local_error_design, relay_schedules
 from heliograph_studies.successive_relays.raw_moments import recompute
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, gains_of, network_of, relative, unusual
@@ -72,6 +72,22 @@ def test_a_network_of_another_kind_agrees_with_raw_moments(scale):
         assert relative(design.covariance[name], result.covariance[name]) < TOLERANCE
         largest = result.correlation[name].max()
         assert largest < 1e-10 if scale == 0.0 else largest > 1e-3
+
+
+def test_gains_on_what_nobody_transmits_are_not_used():
+    """With them a schedule would miss what never comes, and claim nothing."""
+    net, random = example(), np.random.default_rng(0)
+    gains = {
+        name: random.normal(size=(4, len(net.states), size))
+        for name, size in zip(net.filters, net.received, strict=True)
+    }
+    idle = {name: [not net.slots[k % 2].get(name) for k in range(4)] for name in net.filters}
+    used = {name: np.where(np.array(idle[name])[:, None, None], 0.0, gain) for name, gain in gains.items()}
+    schedules, without = (relay_schedules(net, given_design(net, g)) for g in (gains, used))
+    assert any(np.any(gains[name] != used[name]) for name in gains)
+    for name, schedule in schedules.items():
+        for of_all, of_used in zip(schedule.gains, without[name].gains, strict=True):
+            np.testing.assert_array_equal(of_all, of_used)
 
 
 def test_the_next_trace_is_quadratic_about_the_gain():

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.linear.jump_system import moved
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
@@ -50,6 +51,14 @@ def covariance_step(
     else:
         after = rounded - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
+
+
+def information_step(
+    predicted: Float[np.ndarray, "*nodes n n"], information: Float[np.ndarray, "*nodes n n"]
+) -> Float[np.ndarray, "*nodes n n"]:
+    """P = (P-^-1 + J)^-1 = (I + P- J)^-1 P- by the information J = C' Cov(v)^-1 C; P- may be singular."""
+    after = np.linalg.solve(np.eye(predicted.shape[-1]) + predicted @ information, predicted)
+    return np.asarray(after + after.swapaxes(-1, -2)) / 2
 
 
 def nearest_covariance(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -161,25 +170,18 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     if schedule.horizon != system.horizon or g.gain.shape[-1] != m:
         got = f"{schedule.horizon} steps of {g.gain.shape[-1]} measurements"
         raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
-    mean, state = system.mean, schedule.start
-    yy, ss = system.covariance, np.zeros((len(state), len(state)))
-    ys = np.zeros((len(mean), len(state)))
+    mean, spread = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
+    q, nothing = len(system.projection), np.zeros((len(system.mean), len(schedule.start)))
     covariances = []
-    # Joint moments of system state y, filter state s and measurement z.
+    # Maps from (y, s) and (w, v) to (y+, s+ = F s + K z + c, x - xhat = W y+ - L s - J z - d).
     for k in range(system.horizon):
         s, now = system.step(k), Gains(*(field[k] for field in g))
-        mean = s.transition @ mean + s.drift
-        z = s.output @ mean + s.offset
-        yy, ys = s.transition @ yy @ s.transition.T + s.process, s.transition @ ys
-        zz, yz, sz = s.output @ yy @ s.output.T + s.noise, yy @ s.output.T, ys.T @ s.output.T
-        # E(x - xhat) and Cov(x - xhat) = row Cov(y, s, z) row'.
-        bias = system.projection @ mean - now.output @ state - now.direct @ z - now.output_offset
-        joint = np.block([[yy, ys, yz], [ys.T, ss, sz], [yz.T, sz.T, zz]])
-        row = np.concatenate([system.projection, -now.output, -now.direct], axis=1)
-        covariances.append(row @ joint @ row.T + np.outer(bias, bias))
-        # s+ = F s + K z + c.
-        state = now.transition @ state + now.gain @ z + now.offset
-        cross = now.transition @ sz @ now.gain.T
-        ss = now.transition @ ss @ now.transition.T + cross + cross.T + now.gain @ zz @ now.gain.T
-        ys = ys @ now.transition.T + yz @ now.gain.T
+        into = np.concatenate([np.eye(len(nothing)), now.gain @ s.output, system.projection - now.direct @ s.output])
+        received = np.concatenate([np.zeros((len(nothing), m)), now.gain, -now.direct])
+        maps = np.concatenate([into @ s.transition, np.concatenate([nothing, now.transition, -now.output])], axis=1)
+        shift = np.concatenate([np.zeros(len(nothing)), now.offset, -now.output_offset])
+        mean = maps @ mean + into @ s.drift + received @ s.offset + shift
+        spread = moved(maps, spread, moved(into, s.process, moved(received, s.noise, 0.0)))
+        covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
+        mean, spread = mean[:-q], spread[:-q, :-q]
     return np.array(covariances)

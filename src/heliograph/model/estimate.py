@@ -7,7 +7,8 @@ import numpy as np
 
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, shown, standard_deviations
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.outliers import is_bounded
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
@@ -77,6 +78,11 @@ def weakest(claims: list[Claim]) -> Claim:
         if not isinstance(claim, str) or claim not in STRENGTH:
             raise fail("claim", f"one of {', '.join(STRENGTH)}", shown(claim))
     return min(claims, key=STRENGTH.__getitem__)
+
+
+def given_bounds(claim: Claim, *models: PyTree) -> Claim:
+    """Lower a claim to "upper" where some noise of these models is known by a bound of its covariance alone."""
+    return weakest([claim, "upper"]) if is_bounded(*models) else claim
 
 
 def is_sound(estimate: Estimate) -> np.ndarray:

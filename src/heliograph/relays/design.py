@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
+from heliograph.model.estimate import given_bounds
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
@@ -123,7 +124,7 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     """Return every filter of a design as a schedule of gains, to save, to simulate or to run.
 
     s+ = A s + K (z - B s - b), where B s + b is the mean of z if the filter's own estimate were everybody's. Claim:
-    "exact" for complete data from the network it was designed for.
+    "exact" for complete data from the network it was designed for, "upper" where noise is known by bounds.
 
     Args:
         network: relays that filter.
@@ -147,13 +148,15 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         mine = slice(ends[name] - size, ends[name])
         error = slice((1 + f) * n, (2 + f) * n)
         believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
-        gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]
+        # Gains on what nobody transmits are not used.
+        gain = design.gains[name] * np.asarray(steps.live)[:, None, mine]
+        expected, constant = rows[:, mine], constants[:, mine]
         # s+ = (A - K B) s + K z + a - K b.
         transition = steps.transition - gain @ expected
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
         arrays = Gains(*moved, *moved, expected, constant, *believed)
-        schedules[name] = Schedule(arrays, network.initial()[0], "exact")
+        schedules[name] = Schedule(arrays, network.initial()[0], given_bounds("exact", network))
     return schedules
 
 
@@ -205,7 +208,8 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     """Return the linear minimum-mean-square-error filter of x_k from everything that the receiver received up to k.
 
     Its state is an estimate of (x, e_1, ..., e_relays), e_r = x - s_r, which moves linearly; the random gains add white
-    noise, with the covariance that their second moments give. Claim: "exact" for complete data.
+    noise, with the covariance that their second moments give. Claim: "exact" for complete data, "upper" where noise is
+    known by bounds.
 
     Args:
         network: the relay network.
@@ -214,7 +218,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
-    return lmmse(receiver_system(network, gains))
+    return lmmse(receiver_system(network, gains), given_bounds("exact", network))
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:

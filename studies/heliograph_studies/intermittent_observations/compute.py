@@ -9,6 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.linear import CriticalArrival
+from heliograph.planning.moments import steady_covariance
 from heliograph.random_affine import AbstractRandomAffine
 from heliograph.simulation import Boundedness
 from heliograph_studies import Sampled, Stages, Unlisted
@@ -208,13 +209,10 @@ def lower(example: Example, fail: float, recover: float) -> float:
 
     S_loss = fail w_0 Q + (1 - recover) (A S_loss A' + w_1 Q), w the long-run shares.
     """
-    a, q, n = example.transition, example.process * np.eye(example.states), example.states
-    lost = fail / (fail + recover)
-    square = np.kron(a, a)
+    a, q, lost = example.transition, example.process * np.eye(example.states), fail / (fail + recover)
     if (1 - recover) * np.abs(np.linalg.eigvals(a)).max() ** 2 >= 1:
         return float("inf")
-    start = (lost * q).ravel()  # fail w_0 + (1 - recover) w_1 = w_1
-    s = np.linalg.solve(np.eye(n * n) - (1 - recover) * square, start).reshape(n, n)
+    s = steady_covariance(np.sqrt(1 - recover) * a, lost * q)  # fail w_0 + (1 - recover) w_1 = w_1
     return float(np.trace(s + recover * a @ s @ a.T + (1 - lost) * q))
 
 

@@ -27,9 +27,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import heliograph as hg
+from heliograph.linear.recursion import information_step
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information, updated
+from heliograph.planning.paths.model import Paths, Plants, error_covariances, path_information
 from heliograph.planning.paths.relaxation import envelope, split_paths
 from heliograph_studies.network_design.feedback import fed_back_channel as fed_back_channel
 from heliograph_studies.network_design.feedback import feedback_limit as feedback_limit
@@ -190,7 +191,7 @@ def _greedy(paths: Paths, information: Float[np.ndarray, "path"]) -> Steps:
     before: list[np.ndarray] = []
     taken: list[int] = []
     for _ in range(LONGEST):
-        after = [updated(a @ p @ a.T + q, received) for received in alone]
+        after = [information_step(a @ p @ a.T + q, received) for received in alone]
         best = int(np.argmin([np.trace(covariance) for covariance in after]))
         p = after[best]
         for k, past in enumerate(before):

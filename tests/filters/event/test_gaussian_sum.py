@@ -143,6 +143,24 @@ def test_the_stochastic_trigger_without_hidden_losses_is_a_kalman_filter_with_an
         assert result.covariance[k, 0, 0] == pytest.approx(variance, rel=1e-12)
 
 
+def test_the_stochastic_trigger_claims_exactly_only_where_the_posterior_is_a_gaussian():
+    """What was sent says no more than its value if it arrives as it is, and silence leaves a Gaussian a Gaussian."""
+    skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+    trigger, exact = hg.StochasticTrigger(2.0, losses="known"), (PLANT, SENSOR, hg.erasure(hg.hop(-3.0, 0.0), 0.8))
+    assert hg.event_filter(*exact, trigger).claim == "exact"
+    others = [
+        (PLANT, SENSOR, hg.hop(1.0, 0.1)),
+        (PLANT, SENSOR, hg.hop(0.0, 0.0)),
+        (PLANT, hg.LinearSensor([[1.0]], hg.StudentT(0.1, 5.0)), hg.perfect()),
+        (hg.LinearPlant([[0.9]], skewed, [0.0], 1.0), SENSOR, hg.perfect()),
+        (hg.LinearPlant([[0.9]], 0.1, [0.0], skewed), SENSOR, hg.perfect()),
+    ]
+    assert [hg.event_filter(*models, trigger).claim for models in others] == ["nominal"] * 5
+    assert [hg.event_filter(*models, hg.Periodic(2)).claim for models in others] == ["exact"] * 5
+    pair, two = hg.LinearSensor([[1.0], [1.0]], np.eye(2)), hg.parallel([hg.erasure(hg.perfect(), 0.8)] * 2)
+    assert hg.event_filter(PLANT, pair, two, trigger).claim == "nominal"  # what is missing was sent too
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "trigger",
@@ -205,3 +223,25 @@ def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, r
     e, variance = np.asarray(innovation.value)[:, 0], np.asarray(innovation.covariance)[:, 0, 0]
     assert np.trapezoid(density * e, z) / sent == pytest.approx(0, abs=1e-5)
     assert np.trapezoid(density * e**2 / variance, z) / sent == pytest.approx(1, abs=1e-5)
+
+
+NOISE_FREE = {
+    "tied states": (
+        hg.LinearPlant([[0.5, -0.8], [0.0, -0.8]], np.outer([0.38, 14.6], [0.38, 14.6]), [2e4, 8e4], np.zeros((2, 2))),
+        hg.LinearSensor([[-1.5e-3, 1e-3]], 0.0), hg.perfect(), hg.SendOnDelta(1.0),
+    ),
+    "each alone": (
+        hg.LinearPlant([[0.5, 0.4], [-0.1, -0.2]], [[0.053, 0.0166], [0.0166, 0.0052]], [0.0, 0.0], 1e-4 * np.eye(2)),
+        hg.LinearSensor([[2.5, 0.72], [6.4, 3.5]], np.zeros((2, 2))), hg.parallel([hg.erasure(hg.perfect(), 0.8)] * 2),
+        hg.SendOnDelta([0.035, 0.13], region="each"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOISE_FREE)
+def test_outputs_without_noise_leave_no_negative_variance(name):
+    plant, sensor, link, trigger = NOISE_FREE[name]
+    node = hg.Node(sensor, link, {"f": hg.event_filter(plant, sensor, link, trigger)}, trigger=trigger)
+    record = hg.monte_carlo(hg.Network(plant, {"a": node}), horizon=8, runs=16, key=1)
+    assert record.failures() == []

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, sized
@@ -11,16 +12,18 @@ from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.side_information import SideInformation, by_pattern
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim
+from heliograph.model.estimate import Claim, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
 
 
 def event_filter(
@@ -43,8 +46,9 @@ def event_filter(
     `trigger` says. A nonlinear plant or sensor goes through `transform`, `Cubature()` unless given (`Linearization()`
     makes it an extended filter).
 
-    Claim: "exact" behind a `StochasticTrigger` without losses, or with losses that are known, and behind `Periodic`,
-    where plant and sensor are linear and no gain is random; else "nominal".
+    Claim: "exact" where plant and sensor are linear and no gain is random, behind `Periodic`, and behind a
+    `StochasticTrigger` whose losses are none or known, if all noise is Gaussian and what arrives is y itself up to a
+    known gain (through a noisy link, that it was sent says more of y than the filter uses); else "nominal".
 
     Args:
         plant: linear or not; it may vary over time.
@@ -72,7 +76,7 @@ def event_filter(
     described, initial = _described(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    loses = any(np.any(np.asarray(step.chance)[:, ~np.all(step.present, axis=1)] > 0) for step in steps)
+    loses = any(_loses(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     shared: dict[str, Any] = {
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
@@ -80,9 +84,7 @@ def event_filter(
     }  # fmt: skip
     # A random trigger: one Gaussian is enough.
     if isinstance(trigger, StochasticTrigger | Periodic):
-        sure = is_linear(plant, sensor) and all(_is_known(step) for step in steps) and not uncertain_chain(channel)
-        hidden = loses and trigger.losses == "unknown" and isinstance(trigger, StochasticTrigger)
-        claim: Claim = "exact" if sure and not hidden else "nominal"
+        claim = _claim_of(plant, sensor, channel, trigger)
         return StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received))
     # A threshold: which losses and regions the sum holds.
     expected = "SendOnDelta, SendOnPredictionError or another of these"
@@ -111,9 +113,51 @@ def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray
     return over_time(parts) if isinstance(channel, OverTime) else parts[0], np.asarray(steps[0].initial)
 
 
+def _claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
+    """ "exact" where one Gaussian is the posterior, or behind a schedule has its first two moments."""
+    steps = unstack(_described(channel)[0])
+    if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_is_known(step) for step in steps):
+        return "nominal"
+    if isinstance(trigger, Periodic):
+        return given_bounds("exact", plant, sensor, channel)
+    hidden = trigger.losses == "unknown" and any(_loses(step) for step in steps)
+    return "exact" if all(_reveals(s) for s in steps) and _is_gaussian(plant, sensor) and not hidden else "nominal"
+
+
+def _loses(channel: SideInformation) -> bool:
+    """True if some pattern of arrivals in which not all arrives is possible."""
+    return bool(np.any(np.asarray(channel.chance)[:, ~np.all(channel.present, axis=1)] > 0))
+
+
 def _is_known(channel: SideInformation) -> bool:
     """True if no gain is random, and what arrives is all that was sent."""
-    return _alike(channel) and not np.any(np.asarray(channel.spread)[..., :-1, :-1])
+    return _alike(channel) and not np.any(_spread(channel)[..., :-1, :-1])
+
+
+def _spread(channel: SideInformation) -> np.ndarray:
+    """Spread of gain and noise, without what rounding leaves of a known gain behind losses."""
+    gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
+    size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
+    size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
+    return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
+
+
+def _is_gaussian(*models: PyTree) -> bool:
+    """True if all noise in these models is Gaussian, so that silence of probability exp(-e' W e / 2) leaves it so."""
+    leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
+    return all(isinstance(leaf, Gaussian) for leaf in leaves if isinstance(leaf, AbstractNoise))
+
+
+def _reveals(channel: SideInformation) -> bool:
+    """True if whatever arrives determines y: then it says all that its having been sent says."""
+    possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
+    for j, a in possible:
+        gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
+        size = np.abs(gain).max(axis=1, keepdims=True)
+        free = rows.all() and not np.any(_spread(channel)[j, a])
+        if not free or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < gain.shape[1]:
+            return False
+    return True
 
 
 def _alike(channel: SideInformation) -> bool:

@@ -11,7 +11,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor
-from heliograph.numerics.linalg import psd_solve, symmetrize
+from heliograph.numerics.linalg import psd_solve, symmetrize, with_rounding
 
 
 def augmented(
@@ -72,7 +72,8 @@ def updated(
         cross = jnp.where(there[:, None], gain @ covariance[y], 0.0)
         solved = psd_solve(seen, cross)
         middle = centre + jnp.where(there, z - expected, 0.0) @ solved
-        return middle, symmetrize(covariance - cross.T @ solved), log_density(z - expected, total, jnp.abs(z))
+        left = symmetrize(with_rounding(covariance, m) - cross.T @ solved)
+        return middle, left, log_density(z - expected, total, jnp.abs(z))
 
     centre, covariance, density = jax.vmap(single)(parts.mean, parts.covariance)
     if delivers:  # y is z, to the last digit

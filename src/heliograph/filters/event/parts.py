@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import symmetrize, with_rounding
 from heliograph.numerics.types import Array, Float
 
 FLOOR = 1e-6  # probability of what the rule forbids
@@ -92,7 +92,8 @@ def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array |
     shift = jnp.where(possible, moments.mean, 0.0)
     less = jnp.where(possible, 1 - moments.variance, 0.0)
     mean = parts.mean + gain * shift[:, None]
-    covariance = parts.covariance - less[:, None, None] * gain[:, :, None] * gain[:, None]
+    covariance = jax.vmap(lambda p: with_rounding(p, 1))(parts.covariance)
+    covariance = covariance - less[:, None, None] * gain[:, :, None] * gain[:, None]
     return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
 
 

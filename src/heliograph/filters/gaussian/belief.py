@@ -11,7 +11,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, T
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import MomentsSmootherStep, moments_smoother_step
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.numerics.angle import wrapped
@@ -120,7 +120,8 @@ def open_loop_filter(
         initial_mean: mean (n,) of the first state; the plant's by default.
         initial_covariance: its covariance (n, n); the plant's by default.
 
-    Claim: "exact" for a linear plant started from its initial law, else "nominal".
+    Claim: "exact" for a linear plant started from its initial law ("upper" where noise is known by bounds), else
+        "nominal".
 
     Raises:
         ValueError: an initial mean or covariance of the wrong shape.
@@ -129,7 +130,8 @@ def open_loop_filter(
     """
     start = check_plant(plant)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
-    claim: Claim = "exact" if isinstance(start, LinearPlant) and not prior_given and not start.circular else "nominal"
+    linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
+    claim = given_bounds("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

@@ -21,7 +21,7 @@ from heliograph.filters.linear.plan import plan
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import linear_smoother_step, observed_through
 from heliograph.model.channel import Channel, check_link, mean_gain, perfect, received_angles
-from heliograph.model.estimate import Claim, Innovation
+from heliograph.model.estimate import Innovation, given_bounds
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
@@ -32,7 +32,6 @@ from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
-from heliograph.random_affine.outliers import is_bounded
 
 
 class GaussianFilter(AbstractBeliefFilter):
@@ -167,8 +166,7 @@ def _build(
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
-    proved: Claim = "upper" if is_bounded(plant, sensor, channel) else "exact"
-    claim = proved if linear and trusted and not prior_given else "nominal"
+    claim = given_bounds("exact" if linear and trusted and not prior_given else "nominal", plant, sensor, channel)
     return GaussianFilter(
         plant=plant,
         sensor=sensor,

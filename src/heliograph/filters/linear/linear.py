@@ -23,7 +23,7 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrac
 from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.wrappers.delay import as_current, behind_delays
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -225,7 +225,9 @@ def linear_filter(
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         **sized(
-            "upper" if whole.uncertain or is_bounded(plant, sensor, channel) else "exact", start, first(channel).outputs
+            given_bounds("upper" if whole.uncertain else "exact", plant, sensor, channel),
+            start,
+            first(channel).outputs,
         ),
     )
 

@@ -18,7 +18,7 @@ from heliograph.linear.polynomial import memory_system
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
@@ -32,6 +32,7 @@ from heliograph.random_affine.moments.moment_noise import about_mean
 from heliograph.random_affine.moments.monomials import count, monomials, position
 from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.outliers import is_bounded
 
 Part = TypeVar("Part", AbstractPlant, AbstractSensor, AbstractRandomAffine)
 T = TypeVar("T")
@@ -223,8 +224,9 @@ def polynomial_filter(
             reached a steady state by then.
         degree: of the polynomial in z_k; 2 by default.
 
-    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are used), or where rounding is more
-    than 1e-6 of a claimed variance, with a warning: behind a random gain, far from zero.
+    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are used), where noise is known by
+    bounds ("upper" at degree 1), or where rounding is more than 1e-6 of a claimed variance, with a warning: behind a
+    random gain, far from zero.
 
     Raises:
         ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
@@ -232,7 +234,7 @@ def polynomial_filter(
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
-    claim = lmmse(system, claim_of(channel)).claim
+    claim = lmmse(system, claim_of(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     return PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
 
@@ -274,7 +276,7 @@ def scheduled_polynomial_filter(
     Source: as `polynomial_filter`.
     """
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
-    inner = ScheduledFilter(lmmse(system, claim_of(channel)), first(plant).states)
+    inner = ScheduledFilter(lmmse(system, claim_of(plant, sensor, channel, degree)), first(plant).states)
     return PolynomialFilter(inner, degree, centre=centre)
 
 
@@ -348,7 +350,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
     check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
-    claim = claim_of(channel)
+    claim = claim_of(plant, sensor, channel, 2)
     # The linear filter's gains are needed for the moments of its products with z.
     centre, system = _lifted(plant, sensor, channel, 1, horizon)
     linear = lmmse(system, claim)
@@ -358,8 +360,16 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
 
 
-def claim_of(channel: Channel) -> Claim:
-    """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
+def claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
+    """ "exact" if all laws are known, "nominal" if some probability is uncertain.
+
+    Where noise is known by a bound of its covariance alone, "upper" at degree 1, and "nominal" beyond, since no higher
+    moment has a bound.
+    """
+    if degree > 1 and is_bounded(plant, sensor, channel):
+        return "nominal"
     if first(channel).remembers:
-        return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
-    return "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
+        claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
+    else:
+        claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
+    return given_bounds(claim, plant, sensor, channel)

@@ -8,6 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import Plan, PlannedFilter
 from heliograph.filters.modes.modal import ObservationModel, observation_models
+from heliograph.linear.jump_system import mixed, moved
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.enlarged import with_past
 from heliograph.model.over_time import at, first
@@ -104,36 +105,30 @@ def true_error(
 
 def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Propagate moments through x+ = A x + b + w, s- = F s + f, and a transition of the modes."""
-    n, given = len(plant.states), jnp.asarray(u)
-    size = moments.shape[-1]
-    move = np.zeros((size, size))
+    n, given, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
+    move, noise = np.zeros((2, size, size))
     move[:n, :n], move[n, n] = plant.transition_matrix(given), 1.0
     move[:n, n] = plant.shift(given)
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = plan.transition, plan.drift
-    noise = np.zeros((size, size))
     noise[:n, :n] = plant.noise_covariance(given)
-    moved: np.ndarray = np.einsum("ij,iab->jab", rows, move @ moments @ move.T + moments[:, n, n, None, None] * noise)
-    return moved
+    before = mixed(rows, moments)
+    return np.asarray(moved(move, before, before[:, n, n, None, None] * noise))
 
 
 def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
     """Propagate moments through s = s- + K (z - C s- - c), z = (G, n) of the mode times y~ = C~ x~ + v."""
-    n, p = sensor.matrix.shape[1], sensor.matrix.shape[0]
-    size, gain = moments.shape[-1], np.asarray(plan.gain)
+    p, n = sensor.matrix.shape
+    gain, mean, law = np.asarray(plan.gain), np.asarray(world.mean), moments[:, n, n, None, None]
     measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
-    errors = []
     # Given the mode: the mean map of r, then what the gain's spread and the noise add.
-    for moment, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
-        law = moment[n, n]
-        use = np.eye(size)
-        use[n + 1 :, : n + 1] += gain @ mean @ measure
-        use[n + 1 :, n + 1 :] -= gain @ plan.output
-        use[n + 1 :, n] -= gain @ plan.offset
-        second = measure @ moment[: n + 1, : n + 1] @ measure.T + law * noise
-        added = np.einsum("mlab,ab->ml", spread, second) + law * mean @ noise @ mean.T
-        after = use @ moment @ use.T
-        after[n + 1 :, n + 1 :] += gain @ added @ gain.T
-        errors.append(after)
-    return np.array(errors)
+    use = np.zeros_like(moments) + np.eye(moments.shape[-1])
+    use[:, n + 1 :, : n + 1] += gain @ mean @ measure
+    use[:, n + 1 :, n + 1 :] -= gain @ plan.output
+    use[:, n + 1 :, n] -= gain @ plan.offset
+    second = moved(measure, moments[:, : n + 1, : n + 1], law * noise)
+    added = np.einsum("jmlab,jab->jml", np.asarray(world.spread), second) + law * moved(mean, noise, 0.0)
+    after: np.ndarray = moved(use, moments, 0.0)
+    after[:, n + 1 :, n + 1 :] += moved(gain, added, 0.0)
+    return after

@@ -278,7 +278,8 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
             the last digit. A combination of atoms that leaves z without randomness, as a link that is off does, counts
             where z agrees with it to this resolution, and only there.
 
-    Claim: "nominal".
+    Claim: "nominal". With next to no noise in plant and link the one Gaussian after each step may leave out the true
+        mode: squared errors were 1e11 times the claim.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a gain that drifts, parts that do not fit, a law with no

@@ -15,7 +15,7 @@ from heliograph.filters.linear.linear import LinearBelief, corrected_linear, mov
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AnyPlant
@@ -160,7 +160,8 @@ def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> M
         sensor: a linear sensor, m outputs.
         channel: from the sensor to the filter, without the flags and without erasures.
 
-    Claim: "exact", given the side information; "nominal" where probabilities within a mode are uncertain.
+    Claim: "exact", given the side information; "upper" where noise is known by bounds, "nominal" where probabilities
+        within a mode are uncertain.
 
     Raises:
         ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
@@ -205,7 +206,9 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
         channel=channel,
         late=late,
         **sized(
-            "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel),
+            given_bounds(
+                "nominal" if late and uncertain_chain(channel) else claim_of_modes(channel), plant, sensor, channel
+            ),
             start,
             first(channel).outputs + len(memories(channel)),
         ),

@@ -270,7 +270,8 @@ def imm_filter(
         transform: moments of a nonlinear function; `Cubature()` by default, not used for linear parts.
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
-    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps.
+    Claim: "nominal". It tends to be too small where modes are hard to distinguish for many steps. With next to no
+    noise in plant and link the merged Gaussian may leave out the true mode: squared errors were 1e11 times the claim.
 
     Raises:
         ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain among others.
@@ -295,6 +296,7 @@ def gpb1_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal", and too small where fading is slow: the correlation of state and mode is dropped at each step.
+    With next to no noise it may leave out the true mode, as `imm_filter`.
 
     Raises:
         ValueError: as for `imm_filter`.
@@ -317,7 +319,8 @@ def gpb2_filter(
         nodes: number of modes that stand for a gain that drifts; 3 by default.
 
     Claim: "nominal". With few modes that the data distinguish it is close to the best filter; behind slow fading of
-    many modes it is too small, as for the others.
+    many modes it is too small, as for the others. With next to no noise in plant and link squared errors were 17 times
+    the claim.
 
     Raises:
         ValueError: as for `imm_filter`.

@@ -23,7 +23,7 @@ from heliograph.filters.modes.modal import (
     without_common,
 )
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
@@ -284,7 +284,7 @@ def side_information_filter(
             as `with_flag` delivers it. Flags that identify the mode make it the Kalman filter given the modes. None by
             default: no flags.
 
-    Claim: "exact"; "nominal" where probabilities are uncertain.
+    Claim: "exact"; "upper" where noise is known by bounds, "nominal" where probabilities are uncertain.
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, flags that are no probabilities.
@@ -309,7 +309,11 @@ def side_information_filter(
         channel=over_time(described) if isinstance(channel, OverTime) else described[0],
         initial=steps[0].initial,
         flagged=flags is not None,
-        **sized("exact" if known else "nominal", start, first(channel).outputs + (flags is not None)),
+        **sized(
+            given_bounds("exact" if known else "nominal", plant, sensor, channel),
+            start,
+            first(channel).outputs + (flags is not None),
+        ),
     )
 
 

@@ -13,7 +13,7 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.centred import predicted_signal
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
@@ -171,5 +171,5 @@ def fed_back_filter(
     refuse_angles("filter that is fed back", plant, sensor)
     described = base.channel.values if isinstance(base.channel, OverTime) else base.channel
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
-    claim: Claim = "exact" if exact else "nominal"
+    claim = given_bounds("exact" if exact else "nominal", plant, sensor, channel)
     return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

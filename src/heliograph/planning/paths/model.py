@@ -18,6 +18,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.linear.jump_system import JumpSystem
+from heliograph.linear.recursion import information_step
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank
 from heliograph.numerics.module import readable
@@ -73,12 +74,6 @@ def fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     raise fail("steady error", "one that converges (the plant is unstable in a state that nobody receives)", "growth")
 
 
-def updated(predicted: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Posterior covariance (X^-1 + J)^-1 = X (I + J X)^-1, where X may be singular."""
-    after = np.linalg.solve(np.eye(len(predicted)) + predicted @ information, predicted)
-    return np.asarray((after + after.T) / 2)
-
-
 def covariances(plants: Plants, information: Matrices) -> Matrices:
     """Posterior covariance P_k of each step under the information received at each step.
 
@@ -97,7 +92,7 @@ def covariances(plants: Plants, information: Matrices) -> Matrices:
     for k, received in enumerate(information):
         if k:
             predicted = a[k] @ posteriors[-1] @ a[k].T + q[k]
-        posteriors.append(updated(predicted, received))
+        posteriors.append(information_step(predicted, received))
     return np.array(posteriors)
 
 

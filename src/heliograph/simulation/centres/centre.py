@@ -27,7 +27,7 @@ from heliograph.fusion.cross_covariance import (
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, weakest
+from heliograph.model.estimate import Claim, Estimate, given_bounds, weakest
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
@@ -219,7 +219,7 @@ Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
 
 
 def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
-    """Claim of fusion by an informed rule: "exact", "nominal" where a law is not known or filters are not linear.
+    """Claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
 
     `shared`: whether the nodes receive parts of one channel.
 
@@ -235,7 +235,8 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
         _check_along_estimates(rule, nodes, shared)
         return "nominal"
     _check_linear(rule, plant, nodes)
-    return "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
+    known: Claim = "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
+    return given_bounds(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
 def along_estimates(nodes: Parts) -> bool:

@@ -10,13 +10,13 @@ import numpy as np
 
 from heliograph.filters.linear.plan import Linearised, linearised_step
 from heliograph.fusion.all_reports import AllReports, Knowledge
-from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, initial_errors, observation_noise
+from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, advance, initial_errors
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import Array, PyTree
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.centre import gathered
 
 
@@ -75,11 +75,12 @@ class LinearisedCentre(Module):
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors; the rule weights the reports by them.
             step = _shared_step(matrix, keep, linear.gain)
-            errors = _advanced(before.errors, step, motion.noise, linear.noise)
+            after = advance(before.errors, step, motion, linear.noise)
+            errors = before.errors._replace(bias=after.bias, joint=after.joint)  # the plant's moments are not known
             if isinstance(rule, AllReports):
                 step = step._replace(drift=_drift(before.rule, matrix, moved, keep, linear))
-            after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, linear.noise, errors), reports)
-            following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
+            known, (mean, covariance) = rule.use(before.rule, Happened(motion, step, linear.noise, errors), reports)
+            following[name], results[name] = Followed(errors, mean, known), Estimate(mean, covariance, self.claim)
         return following, results
 
 
@@ -94,12 +95,3 @@ def _drift(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Arra
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)
-
-
-def _advanced(errors: Errors, step: ErrorStep, noise: Array, received: Array) -> Errors:
-    """Propagate the moments of all pairs; moments of the plant itself are not known."""
-    once = jnp.einsum("iab,ibjc->iajc", step.transition, errors.joint)
-    both = jnp.einsum("iajb,jcb->iajc", once, step.transition)
-    shared = jnp.einsum("iab,bc,jdc->iajd", step.of_noise, noise, step.of_noise)
-    bias = jnp.einsum("iab,ib->ia", step.transition, errors.bias)
-    return errors._replace(bias=bias, joint=both + shared + observation_noise(step.gain, received))

@@ -6,9 +6,10 @@ Without noise J+ = E[M J M'], where a lost edge (j, i) takes D_ij = c_ij F_i A (
 """
 
 import numpy as np
-import scipy
 
 from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.joint import congruence, spread
+from heliograph.linear.recursion import information_step
 from heliograph.numerics.check import fail
 
 STEPS, LAST = 100, 40  # of the recursion, and those by which its growth is judged
@@ -50,9 +51,7 @@ def _steps(
     total = np.where(graph.present[:, :, None, None], squares[graph.senders], 0.0).sum(axis=1)
     p = np.tile(np.eye(n), (len(squares), 1, 1))
     for _ in range(STEPS):
-        before = a @ p @ a.T + q
-        p = np.linalg.solve(np.eye(n) + before @ total, before)
-        p = (p + p.swapaxes(1, 2)) / 2
+        p = information_step(a @ p @ a.T + q, total)
     # c_ij F_i A e_j, and -c_ij F_i A e_i - P_i S_j A e_i.
     pulled = shares[:, :, None, None] * ((np.eye(n) - p @ total) @ a)[:, None]
     return a - p @ squares @ a, pulled, -pulled - p[:, None] @ squares[graph.senders] @ a
@@ -66,10 +65,7 @@ def _growth(
     # Mean over what gets lost, and its variance.
     mean = arrives[:, :, None, None] * pulled
     mean[:, 0] = alone + (arrives[:, :, None, None] * pushed)[:, 1:].sum(axis=1)
-    ends = np.concatenate([[0], np.cumsum(graph.present.sum(axis=1))])
-    m = scipy.sparse.bsr_array(
-        (mean[graph.present], graph.senders[graph.present], ends), shape=(nodes * n,) * 2, blocksize=(n, n)
-    )
+    m = spread(mean, graph.senders, graph.present)
     variance = (arrives * (1 - arrives))[:, :, None, None]
     # Second moments without noise, in units of their size before a step.
     joint, logarithms, places, senders = np.eye(nodes * n), [], np.arange(nodes), graph.senders
@@ -80,7 +76,7 @@ def _growth(
         top = np.concatenate([np.broadcast_to(blocks[places, :, places, :][:, None], cross.shape), cross], axis=3)
         below = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
         more = both @ np.concatenate([top, below], axis=2) @ both.swapaxes(2, 3)
-        joint = m @ np.ascontiguousarray((m @ joint).T)
+        joint = np.asarray(congruence(m, joint))
         joint.reshape(nodes, n, nodes, n)[places, :, places, :] += (variance * more).sum(axis=1)
         # Their size, of which the next step is a multiple.
         logarithms.append(np.log(np.trace(joint)))

@@ -12,6 +12,7 @@ import scipy
 from heliograph.fusion.mesh.joint import blocks_of, congruence, joint_after, spread, transitions, used
 from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
+from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
@@ -211,9 +212,7 @@ def best_possible(
     covariance = np.array(start.covariance)
     for model, total in zip(steps, reversed(information), strict=True):
         a = np.asarray(model.motion.matrix)
-        predicted = a @ covariance @ a.T + model.motion.noise
-        covariance = np.linalg.solve(np.eye(len(a)) + predicted @ total, predicted)
-        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+        covariance = information_step(a @ covariance @ a.T + model.motion.noise, total)
     return covariance
 
 
