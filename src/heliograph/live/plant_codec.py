@@ -56,12 +56,16 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     events = [(i, name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
     return PlantParts(
         head={"now": plant.now, "forced": plant.forced, "origin": origin, "links": links},
-        keys=np.array([row.key[1:] for row in rows], dtype=np.int64),
-        events=np.array([(i, *name[:2]) for i, name, _ in events], dtype=np.int64),
+        keys=_integers([number for row in rows for number in row.key[1:]], 2),
+        events=_integers([number for i, name, _ in events for number in (i, name[0], name[1])], 3),
         table=fleet.pool.table[[row.slot for row in rows]],
         times=np.array([name[2] for _, name, _ in events]),
         values=np.concatenate([np.zeros(0), *(values for _, _, values in events)]),
     ).to_bytes()
+
+
+def _integers(flat: list[int], width: int) -> np.ndarray:
+    return np.array(flat, dtype=np.int64).reshape(-1, width)
 
 
 def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:

@@ -1,5 +1,6 @@
 """Monte Carlo: the world and every filter in it, simulated run by run in blocks."""
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, cast, get_args
@@ -17,6 +18,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
+from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
@@ -96,7 +98,7 @@ def monte_carlo(
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
-    single = _is_single(precision)
+    single = _is_single(precision, network)
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and not network.meshes and one_processor():
@@ -114,10 +116,20 @@ def monte_carlo(
     return finished(reducer, recorded, network, smoothing)
 
 
-def _is_single(precision: Precision) -> bool:
+def _is_single(precision: Precision, network: Network) -> bool:
     if not isinstance(precision, str) or precision not in get_args(Precision.__value__):
         raise fail("precision", f"one of {', '.join(get_args(Precision.__value__))}", shown(precision))
+    if precision == "float32" and _is_lost(network):
+        said = "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
+        warnings.warn(said, stacklevel=3)
     return precision == "float32"
+
+
+def _is_lost(network: Network) -> bool:
+    """True if some covariance or matrix of plant and sensors is nothing but 0 in single precision."""
+    sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
+    return any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves)
 
 
 class _Job(Module):

@@ -72,6 +72,16 @@ def test_the_printed_recursion_forgets_to_no_noise_after_losses():
     np.testing.assert_array_equal(item.variances(state), item.variances(item.correct(item.init(), [0.3, np.nan])[0]))
 
 
+@pytest.mark.parametrize("value", [1e8, 1e16, -1e20, 1e155])
+def test_no_absurd_value_is_learned_as_noise(value):
+    """By the variance that it leaves behind itself a value is never far: it would hide all others for 4,000 steps."""
+    stream = hg.Stream(hg.adaptive_filter(plain()))
+    before = stream.push([0.3, -0.2])
+    with pytest.raises(ValueError, match=r"measurement of step 1: expected a plausible one, got .* deviations"):
+        stream.push([value, 0.0])
+    assert abs(stream.push([0.2, 0.1]).mean[0]) < 10 * np.sqrt(before.covariance[0, 0])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -99,6 +100,18 @@ def test_single_precision_error_of_a_filter_on_the_same_data():
     assert single.mean.dtype == np.float32
     np.testing.assert_allclose(single.mean, double.mean, atol=1e-5 * np.abs(double.mean).max())
     np.testing.assert_allclose(single.covariance, double.covariance, atol=1e-5 * np.abs(double.covariance).max())
+
+
+@pytest.mark.slow
+def test_what_single_precision_takes_for_none_is_said():
+    """Variances below 1.2e-38, as of states in units of 1e20: claims would be 0."""
+    plant, sensor = hg.LinearPlant([[0.9]], 1e-39, [0.0], 1e-36), hg.LinearSensor([[1.0]], 1e-36)
+    small = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})})
+    with pytest.warns(UserWarning, match="single precision: numbers of plant or sensors below 1.2e-38 count as 0; "):
+        hg.monte_carlo(small, 1, 4, 0, precision="float32")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hg.monte_carlo(network(), 1, 4, 0, precision="float32")
 
 
 def test_an_unknown_precision_is_refused():

@@ -101,7 +101,7 @@ class AdaptiveFilter(AbstractSizedFilter):
             rule,
             law,
         )
-        # The innovation that a Gaussian filter with the learned variances reports.
+        # The innovation that a Gaussian filter with the variances learned before reports.
         value, covariance, present = z - before.signal - noise.center, learned.covariance, ~jnp.isnan(z)
         both = present[:, None] & present[None]
         density = log_density(value, covariance, jnp.abs(z) + jnp.abs(before.signal))
@@ -121,7 +121,10 @@ class AdaptiveFilter(AbstractSizedFilter):
 
 
 class Learned(NamedTuple):
-    """State after the update, innovation covariance (m, m) with the learned variances, weight of each component."""
+    """State after the update, innovation covariance (m, m) with the variances before it, weight of each component.
+
+    By those that were learned from a value itself no value would be far from what was expected.
+    """
 
     after: AdaptiveBelief
     covariance: jax.Array
@@ -170,7 +173,7 @@ def _learn(
     after = AdaptiveBelief(
         x, p, jnp.where(received, after_shape, state.shape), jnp.where(received, noise * after_shape, state.scale)
     )
-    return Learned(after, before.spread + diagonal(last), jnp.where(arrived, shown, jnp.nan))
+    return Learned(after, before.spread + diagonal(scale / shape), jnp.where(arrived, shown, jnp.nan))
 
 
 def _scaled(law: Law, ratio: jax.Array) -> Law:
