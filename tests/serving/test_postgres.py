@@ -13,7 +13,7 @@ from heliograph.serving.storage.store_protocol import identity
 from tests.postgres import Postgres
 from tests.serving import test_sharing
 from tests.serving.storage.test_store import by_plant, journal, states
-from tests.serving.test_run_it_live import retuned
+from tests.serving.test_run_it_live import SAID, piped, retuned
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 pytestmark = pytest.mark.real("PostgreSQL")
@@ -59,6 +59,13 @@ def test_processes_share_a_store_in_postgresql(tmp_path, database):
 def test_a_network_that_was_retuned_goes_on_from_its_store_in_postgresql(tmp_path, monkeypatch, capfd, database):
     monkeypatch.chdir(tmp_path)
     retuned(database, capfd)
+
+
+def test_a_store_in_a_file_begins_from_one_in_postgresql(tmp_path, monkeypatch, capfd, database):
+    monkeypatch.chdir(tmp_path)
+    retuned(database, capfd)
+    assert piped(f"heliograph serve net.py --window 5 --store net.db --from-snapshot '{database}' < rest", capfd)
+    assert "the state is kept in net.db, plants so far: 1 " in SAID.read_text()
 
 
 def test_parts_are_leased_in_postgresql(database):

@@ -1,11 +1,8 @@
 """`heliograph serve`: the filters of a network kept running, from messages to estimates."""
 
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-
-from heliograph.cli.app import path_option
 
 
 def serve(
@@ -22,7 +19,9 @@ def serve(
         ),
     ] = None,
     process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
-    from_snapshot: Annotated[Path | None, path_option("Store of which to begin from the plants.")] = None,
+    from_snapshot: Annotated[
+        str | None, Parameter(help="File or PostgreSQL URL of a store whose plants this one begins with.")
+    ] = None,
     anew: Annotated[
         list[str] | None,
         Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),

@@ -140,7 +140,7 @@ class ServiceSettings:
         options: limits of events and memory.
         store: path or URL of the database; None keeps no state.
         process: name of this process among several.
-        snapshot: store whose plants a new store begins from.
+        snapshot: store whose plants a new store begins from, a file or a PostgreSQL URL.
         broker: the broker; None reads standard input.
         parts: number of parts of the plants that several processes share.
         page: port, or address and port, of the page.
@@ -157,7 +157,7 @@ class ServiceSettings:
     options: Options
     store: str | None = None
     process: str = ""
-    snapshot: Path | None = None
+    snapshot: str | None = None
     broker: Address | None = None
     parts: int | None = None
     page: str | None = None
@@ -170,7 +170,7 @@ class ServiceSettings:
         if self.snapshot is not None:
             if self.store is None:
                 raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
-            if not self.snapshot.is_file():
+            if "://" not in self.snapshot and not Path(self.snapshot).is_file():
                 raise fail(f"snapshot {self.snapshot}", "a store's file", "nothing of that name")
         if self.anew and self.store is None:
             raise fail("--anew", "a store that has the plants (--store FILE)", "none")
@@ -294,7 +294,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     carrier = Carrier(fleet, mine, _say) if settings.accept_changes else None
     store = Store(settings.store, mine, settings.process, carrier=carrier)
     if settings.snapshot is not None:
-        store.begin_from(str(settings.snapshot), mine, carrier)
+        store.begin_from(settings.snapshot, mine, carrier)
     store.begin_anew(settings.anew)
     if store.damaged:
         _say(f"store {store.name}: {report_damage(store.damaged)}")
