@@ -128,8 +128,13 @@ class Store:
 
     def _check_network(self, mine: Identity) -> None:
         """Refuse the state of another network, naming what differs."""
-        differs = changes(mine, self.identity)
-        if differs and _compared(mine) != _compared(self.identity):
+        if _compared(mine) == _compared(self.identity):
+            return
+        try:
+            differs = changes(mine, self.identity)
+        except (KeyError, ValueError, TypeError, AttributeError):  # without its numbers, or with damaged ones
+            differs = []
+        if differs:
             more = f" and {len(differs) - LISTED} more" if len(differs) > LISTED else ""
             got = f"one that differs: {'; '.join(differs[:LISTED])}{more}"
             raise fail(f"store {self.name}", "the state of what is here", got)
