@@ -311,3 +311,14 @@ def test_losses_in_bursts_have_no_mean_here():
     net = network({"m": hg.fusion.MatrixWeights()}, RING, link=burst)
     with pytest.raises(ValueError, match="losses that are independent over steps"):
         hg.simulation.mean_mesh_errors(net, "m", 3)
+
+
+def test_noise_that_is_known_by_a_bound_makes_upper_claims():
+    """`Contaminated.at_most` gives the largest covariance: what is computed with it is no error, but bounds it."""
+    plant, noise = hg.LinearPlant([[0.9]], 0.2, [0.0], 1.0), hg.Contaminated.at_most(0.1, 0.05, 4.0)
+    sensor = hg.LinearSensor([[1.0]], noise)
+    node = hg.Node(sensor, hg.perfect(1), {"own": hg.linear_filter(plant, sensor, hg.perfect(1))})
+    fusion = hg.Fusion("own", hg.fusion.MatrixWeights(), neighbours={"a": ["b"], "b": ["a"]})
+    network = hg.Network(plant, {"a": node, "b": node}, {"mesh": fusion})
+    assert hg.simulation.mesh_errors(network, "mesh", 3).claim == "upper"
+    assert hg.simulation.mean_mesh_errors(network, "mesh", 3).claim == "upper"

@@ -61,16 +61,21 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     _check_fixed(what, fusion, network, graph)
 
 
+def error_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
+    """Claim of the joint covariance of all nodes' errors: "exact", weaker where laws or noises are known by bounds."""
+    parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
+             for node in network.mesh_nodes(name)
+             if isinstance(n := network.nodes[node], Node)}  # fmt: skip
+    return informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
+
+
 def mesh_claim(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """Claim of every node's estimate: "upper" by intersection, "exact" by the joint covariance given what arrived.
 
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
     sender by what it measured, a quantizer by what it cannot send.
     """
-    parts = {node: (n.sensor, n.channel, n.filters[fusion.filter])
-             for node in network.mesh_nodes(name)
-             if isinstance(n := network.nodes[node], Node)}  # fmt: skip
-    known = informed_claim(f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, False)
+    known = error_claim(name, fusion, network)
     senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
     by_data = fusion.quantizer is not None or any(n.trigger is not None for n in senders)
     if by_data or isinstance(fusion.rule, FrozenWeights):

@@ -20,6 +20,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of
+from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.network import Network
 
 SPARSE = 2000  # nodes whose joint covariance fits in memory
@@ -35,7 +36,8 @@ class MeshErrors:
         actual: E[e_i e_i'] (time, node, n, n), given what arrives or in the mean over it.
         claimed: what each node claims (time, node, n, n).
         joint: Cov(e_i, e_j) after the last step (node, n, node, n).
-        claim: of `actual`: "exact", or "nominal" where arrivals were drawn.
+        claim: of `actual`: "exact"; "upper" where noises are known by bounds, "nominal" where laws are known up to a
+            radius.
     """
 
     nodes: tuple[str, ...]
@@ -118,7 +120,8 @@ def mesh_errors(
         claimed.append(claim)
         last = joint
     nodes, n = len(mesh.nodes), actual[0].shape[-1]
-    return MeshErrors(mesh.nodes, np.stack(actual), np.stack(claimed), last.reshape(nodes, n, nodes, n), "exact")
+    of_errors = error_claim(fusion, network.meshes[fusion], network)
+    return MeshErrors(mesh.nodes, np.stack(actual), np.stack(claimed), last.reshape(nodes, n, nodes, n), of_errors)
 
 
 def errors_over_time(

@@ -27,6 +27,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of
 from heliograph.simulation.centres.edges import arrival_chance, edge_links
 from heliograph.simulation.centres.mesh import Mesh, Parts, Rows
+from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.centres.mesh_errors import MeshErrors, mesh_named, models
 from heliograph.simulation.network import Network
 
@@ -96,7 +97,8 @@ def mean_mesh_errors(
         n = len(step.motion.shift)
         errors.append(np.einsum("iaib->iab", joint.reshape(len(names), n, len(names), n)).copy())
         covariance = np.asarray(gains.covariance)[patterns.start]
-    return MeshErrors(names, np.stack(errors), np.stack(errors), joint.reshape(len(names), n, len(names), n), "exact")
+    claim = error_claim(fusion, between, network)
+    return MeshErrors(names, np.stack(errors), np.stack(errors), joint.reshape(len(names), n, len(names), n), claim)
 
 
 @quickly_compiled
