@@ -61,7 +61,7 @@ def _rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]
 
 
 def rounded(value: float, error: float) -> str:
-    """Return a number to two digits of its standard error; to four of its own without one."""
+    """Return a number to two digits of its standard error, to four digits without one."""
     if not (np.isfinite(value) and 0 < error < np.inf):
         return f"{value:.4g}"
     places = 1 - int(np.floor(np.log10(error)))
