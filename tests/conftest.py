@@ -24,7 +24,7 @@ IN_A_HURRY = (
 
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
-MOST, GROWTH = 1.4e9, 0.2e9  # bytes of a process before it lets go, and since it last did
+MOST, GROWTH = 1.2e9, 0.2e9  # bytes of a process before it lets go, and since it last did
 
 
 def pytest_configure(config):
@@ -82,26 +82,19 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 100)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def forget_compiled_programs():
-    """A module's programs are hardly ever another's; kept, they and what the compiler left would be gigabytes."""
-    yield
-    forget()
-
-
-@pytest.fixture(scope="module")
-def memory_at_start():
-    """Of this process, in bytes: a list, to which is added where the module lets go on the way."""
+@pytest.fixture(scope="session")
+def memory_left():
+    """Of this process after it let go, in bytes: a list, to which is added each time."""
     return [resident()]
 
 
 @pytest.fixture(autouse=True)
-def bounded_memory(memory_at_start):
-    """A module that compiles much, as that of all pages of the docs, lets go of it on the way."""
+def bounded_memory(memory_left):
+    """Compiled programs are let go of when they, and what the compiler left, are more than a gigabyte: it takes time."""
     yield
-    if resident() > max(MOST, memory_at_start[-1] + GROWTH):
+    if resident() > max(MOST, memory_left[-1] + GROWTH):
         forget()
-        memory_at_start.append(resident())
+        memory_left.append(resident())
 
 
 def resident():
