@@ -90,7 +90,7 @@ def memory_left():
 
 @pytest.fixture(autouse=True)
 def bounded_memory(memory_left):
-    """Compiled programs are let go of when they, and what the compiler left, are more than a gigabyte: it takes time."""
+    """Compiled programs are let go of when they, and what the compiler left, are a gigabyte: it takes time."""
     yield
     if resident() > max(MOST, memory_left[-1] + GROWTH):
         forget()

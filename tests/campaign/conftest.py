@@ -1,15 +1,6 @@
-"""One campaign that ran undisturbed, for all modules of this folder, and what is compiled for its network."""
+"""One campaign that ran undisturbed, for all modules of this folder."""
 
 import pytest
-
-from tests.conftest import forget
-
-
-@pytest.fixture(scope="package", autouse=True)
-def forget_compiled_programs():
-    """Only after the last of them."""
-    yield
-    forget()
 
 
 @pytest.fixture(scope="session")

@@ -3,8 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from heliograph.codegen.compiled import compile
+from heliograph.filters.innovation import log_density
+from heliograph.numerics.linalg import UNROLL_LIMIT, cholesky, psd_solve
 
 RANDOM = np.random.default_rng(6)
 
@@ -44,3 +47,32 @@ def test_systems_are_solved_with_the_largest_entry_first(n):
     expected = np.linalg.solve(a, b)
     assert np.all(np.abs(x - expected) <= limit * np.abs(expected).max(axis=(1, 2), keepdims=True))
     np.testing.assert_allclose(determinant, np.linalg.det(a), rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 5, pytest.param(UNROLL_LIMIT + 3, marks=pytest.mark.slow)])
+def test_definite_systems_roots_and_densities_are_those_of_the_library(n):
+    """Also of matrices that XLA factors in a loop over columns; to rounding times the matrix's condition."""
+    a, b = RANDOM.normal(size=(20, n, n)), RANDOM.normal(size=(20, n, 2))
+    a = a @ a.transpose(0, 2, 1) + np.eye(n)
+
+    def single(a, b):
+        return psd_solve(a, b), cholesky(a), log_density(b[:, 0], a, jnp.zeros(n))
+
+    x, root, density = compile(single, a[0], b[0])(a, b)
+    limit = 1e-15 * 10 * n * np.linalg.cond(a)[:, None, None]
+    assert np.all(np.abs(x - np.linalg.solve(a, b)) <= limit * np.abs(x).max(axis=(1, 2), keepdims=True))
+    assert np.all(np.abs(root @ root.transpose(0, 2, 1) - a) <= limit * np.abs(a).max(axis=(1, 2), keepdims=True))
+    expected = [multivariate_normal(np.zeros(n), a).logpdf(b[:, 0]) for a, b in zip(a, b, strict=True)]
+    np.testing.assert_allclose(density, expected, rtol=1e-12 * n)
+
+
+def test_products_of_long_arrays_are_those_of_the_library():
+    """By a loop over the left or the right argument's rows, or to one number."""
+    a, b, v = RANDOM.normal(size=(4, 17, 17)), RANDOM.normal(size=(4, 17, 17)), RANDOM.normal(size=(4, 17))
+    products = compile(
+        lambda a, b, v: (a @ b, v @ a, a @ v, jnp.sum(a * b), jnp.einsum("ij,ij", a, b)), a[0], b[0], v[0]
+    )
+    whole = np.einsum("rij,rij->r", a, b)
+    expected = a @ b, np.einsum("ri,rij->rj", v, a), np.einsum("rij,rj->ri", a, v), whole, whole
+    for x, y in zip(products(a, b, v), expected, strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-13 * 17)

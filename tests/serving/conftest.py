@@ -1,18 +1,9 @@
-"""What the modules of this folder share and let go: programs compiled for worlds.py, connections to databases."""
+"""What the modules of this folder let go: connections to databases."""
 
 from collections.abc import Iterator
 from importlib.util import find_spec
 
 import pytest
-
-from tests.conftest import forget
-
-
-@pytest.fixture(scope="package", autouse=True)
-def forget_compiled_programs() -> Iterator[None]:
-    """Only after the last of them."""
-    yield
-    forget()
 
 
 @pytest.fixture(autouse=True)

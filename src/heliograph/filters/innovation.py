@@ -1,5 +1,6 @@
 """Innovations: value, covariance under the filter's model and log-likelihood of each, and a summary of many."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from heliograph.numerics.linalg import (
     rounding,
 )
 from heliograph.numerics.module import readable
-from heliograph.numerics.over_runs import runs_last, runs_last_of
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
@@ -99,15 +100,7 @@ def _shape_of_runs(value: jax.Array, covariance: jax.Array, size: jax.Array) -> 
     return jnp.broadcast_shapes(value.shape[1:], covariance.shape[2:], size.shape[1:])
 
 
-@runs_last_of(_shape_of_runs)
-def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
-    """log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
-
-    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
-    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
-    where it does not: the density is that of the free components. `size` (m,) is the size of the terms whose difference
-    is `value`, for its rounding. An indefinite covariance gives NaN.
-    """
+def _log_density(value: jax.Array, covariance: jax.Array, size: jax.Array, looped: bool) -> jax.Array:
     m = value.shape[0]
     # Absent components: value and covariance zero, so that they are determined and agree.
     present = ~jnp.isnan(value)
@@ -138,12 +131,24 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
 
     none = jnp.zeros_like(jnp.sum(left, axis=(0, 1)))
     carry: tuple[jax.Array, ...] = (rest, left, none, none)
-    if m > UNROLL_LIMIT:
+    if looped:
         carry = jax.lax.fori_loop(0, m, condition, carry)
         return carry[2]
     for j in range(m):
         carry = condition(j, carry)
     return carry[2]
+
+
+@partial(runs_last, shapes=_shape_of_runs, written=partial(_log_density, looped=False))
+def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
+    """log N(value; 0, covariance) of the components that are not NaN, 0 if all are.
+
+    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
+    covariance. A component that those before it determine (s_j = 0) adds nothing where it agrees with them, and -inf
+    where it does not: the density is that of the free components. `size` (m,) is the size of the terms whose difference
+    is `value`, for its rounding. An indefinite covariance gives NaN.
+    """
+    return _log_density(value, covariance, size, looped=len(value) > UNROLL_LIMIT)
 
 
 class Weighed(NamedTuple):

@@ -16,7 +16,7 @@ from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, produ
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.linalg import congruence, contract, factor
+from heliograph.numerics.linalg import congruence, contract, root
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.moments.second_moments import second_order
@@ -198,8 +198,7 @@ def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.A
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
         received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
-        columns, _ = factor(jnp.asarray(received.covariance))
-        z = jnp.stack(columns, axis=1) @ noise - received.value
+        z = root(jnp.asarray(received.covariance)) @ noise - received.value
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())

@@ -14,7 +14,7 @@ from jax.scipy.linalg import solve_triangular
 from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.types import Array, Float
 
-UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
+UNROLL_LIMIT = 8  # above this size XLA compiles a loop over columns in less time; native code is written out always
 PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
 PRECISE = 1e-7  # of a measurement's variance: noise below it costs the short form P - K C half of the digits
@@ -160,20 +160,30 @@ def _spread_jvp(
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Columns of the lower factor, (n, ...) each, and the reciprocals of its diagonal (zero for a zero column).
+    """Columns of the lower factor from the diagonal down, (n - j, ...), and the reciprocals of its diagonal.
 
-    Column by column: what is left of a column after those before it, times the reciprocal root of its pivot. A pivot is
-    judged by the component's own diagonal entry, so that units do not decide what is singular.
+    Column by column: the first column of what is left of A, times the reciprocal root of its pivot; of a zero column
+    that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular.
     """
     columns: list[jax.Array] = []
     scales: list[jax.Array] = []
     growth: jax.Array | float = 0.0
-    for j in range(a.shape[0]):
-        rest = minus(a[j:, j], (c[j:] * c[j] for c in columns))
-        scales.append(pivot_scale(rest[0], a[j, j], growth))
-        growth = jnp.maximum(growth, a[j, j] * scales[j] * scales[j])
-        columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
+    left = a
+    for j in range(len(a)):
+        scale = pivot_scale(left[0, 0], a[j, j], growth)
+        growth = jnp.maximum(growth, a[j, j] * scale * scale)
+        column = left[:, 0] * scale
+        # The Schur complement of the pivot.
+        left = left[1:, 1:] - column[1:, None] * column[1:]
+        columns.append(column)
+        scales.append(scale)
     return columns, scales
+
+
+def lower_factor(columns: list[jax.Array]) -> jax.Array:
+    """Lower matrix of the columns that `factor` returns."""
+    above = [jnp.zeros((j, *c.shape[1:]), c.dtype) for j, c in enumerate(columns)]
+    return jnp.stack([jnp.concatenate(column) for column in zip(above, columns, strict=True)], axis=1)
 
 
 def pivot_scale(pivot: jax.Array, whole: jax.Array, growth: jax.Array | float) -> jax.Array:
@@ -204,22 +214,22 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """`solve` of one A for several B, one after another: it is factored once."""
-    return partial(_over_matrices, _long_solve, a) if len(a) > UNROLL_LIMIT else written_solver(a)
+    return partial(_long_solve, a) if len(a) > UNROLL_LIMIT else written_solver(a)
 
 
 def written_solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """`solver` written out entry by entry, whatever the size."""
     columns, scales = factor(a)
-    n = len(a)
+    rows = lower_factor(columns)
 
     def solved(b: jax.Array) -> jax.Array:
-        forward: list[jax.Array] = []
-        for i in range(n):  # L Y = B
-            forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
-        backward = forward[:]
-        for i in reversed(range(n)):  # L' X = Y
-            backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
-        return jnp.stack(backward)
+        # L Y = B, then L' X = Y from the last row up.
+        left = jnp.stack([rest * scale for rest, scale in zip(_forward(columns, scales, b), scales, strict=True)])
+        x: list[jax.Array] = []
+        for i, scale in reversed(list(enumerate(scales))):
+            x.insert(0, left[i] * scale)
+            left = left[:i] - _beside(rows[i, :i], left) * x[0]
+        return jnp.stack(x)
 
     return solved
 
@@ -241,7 +251,17 @@ def long_factor(a: jax.Array) -> jax.Array:
     return lower
 
 
+@partial(runs_last, written=lambda a: lower_factor(factor(a)[0]), shapes=jnp.shape)
+def _long_root(a: jax.Array) -> jax.Array:
+    return _over_matrices(lambda a, _: long_factor(a), a, a)
+
+
+@partial(runs_last, written=lambda a, b: written_solver(a)(b))
 def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
+    return _over_matrices(_solve_by_loop, a, b)
+
+
+def _solve_by_loop(a: jax.Array, b: jax.Array) -> jax.Array:
     lower = long_factor(a)
     none = jnp.diagonal(lower) == 0
     lower = lower + jnp.diag(none.astype(lower.dtype))
@@ -251,9 +271,7 @@ def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def root(a: jax.Array) -> jax.Array:
     """R, lower, with R R' = A for a positive semidefinite A, a column of zeros where a component adds nothing."""
-    if len(a) > UNROLL_LIMIT:
-        return _over_matrices(lambda a, _: long_factor(a), a, a)
-    return jnp.stack(factor(a)[0], axis=1)
+    return _long_root(a) if len(a) > UNROLL_LIMIT else lower_factor(factor(a)[0])
 
 
 def pivots(a: jax.Array) -> jax.Array:
@@ -309,18 +327,27 @@ def _reciprocals(a: jax.Array) -> jax.Array:
 
 def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
     """Return numerators x_i - sum_j L_ij y_j and reciprocals 1 / L_ii of forward substitution; y_i is their product."""
-    n = a.shape[0]
-    if n > UNROLL_LIMIT:
-        lower = root(a)
-        columns, scales = list(jnp.moveaxis(lower, 1, 0)), list(_reciprocals(diagonal_of(lower)))
+    if len(a) > UNROLL_LIMIT:
+        whole = root(a)
+        columns, scales = [whole[j:, j] for j in range(len(a))], list(_reciprocals(diagonal_of(whole)))
     else:
         columns, scales = factor(a)
-    forward: list[jax.Array] = []
+    return list(zip(_forward(columns, scales, x), scales, strict=True))
+
+
+def _forward(columns: list[jax.Array], scales: list[jax.Array], b: jax.Array) -> list[jax.Array]:
+    """Numerators of L Y = B by the columns of L: each row of Y, once known, is taken off the rows below it."""
     rests: list[jax.Array] = []
-    for i in range(n):  # L y = x
-        rests.append(minus(x[i], (columns[j][i] * forward[j] for j in range(i))))
-        forward.append(rests[i] * scales[i])
-    return list(zip(rests, scales, strict=True))
+    left = b.reshape(b.shape + (1,) * (columns[0].ndim - b.ndim))
+    for column, scale in zip(columns, scales, strict=True):
+        rests.append(left[0])
+        left = left[1:] - _beside(column[1:], left) * (left[0] * scale)
+    return rests
+
+
+def _beside(entries: jax.Array, matrix: jax.Array) -> jax.Array:
+    """A column's entries (n, ...) with axes for the columns of a matrix (n, k, ...)."""
+    return jnp.expand_dims(entries, tuple(range(1, 1 + matrix.ndim - entries.ndim)))
 
 
 def _over_matrices(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
@@ -355,12 +382,12 @@ def cholesky(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
 
     Shapes: (n, n) -> (n, n).
     """
-    return long_factor(jnp.asarray(a)) if a.shape[-1] > UNROLL_LIMIT else _short_cholesky(jnp.asarray(a))
+    return (_long_root if len(a) > UNROLL_LIMIT else _short_cholesky)(jnp.asarray(a))
 
 
 @runs_last_of(jnp.shape)
 def _short_cholesky(a: jax.Array) -> jax.Array:
-    return jnp.stack(factor(a)[0], axis=1)
+    return lower_factor(factor(a)[0])
 
 
 def psd_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:

@@ -26,17 +26,21 @@ _kernel.multiple_results = True
 class _Kernel:
     """Arithmetic of one kernel and that of its derivatives; compared by identity."""
 
-    def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree]):
+    def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree], written: Callable[..., PyTree]):
         # Traced once per shapes, however many filters use it.
         self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
         self.source = source
+        self.written = jax.jit(lambda args, kwargs: written(*args, **kwargs))
 
 
 Shapes = Callable[..., PyTree]  # a kernel's arguments -> the shape of its result, or of each in a tuple
 
 
 def runs_last(
-    kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None, shapes: Shapes | None = None
+    kernel: Callable[P, R],
+    differentiable_as: Callable[P, R] | None = None,
+    shapes: Shapes | None = None,
+    written: Callable[P, R] | None = None,
 ) -> Callable[P, R]:
     """Return a kernel for which vmap puts its axis last in every argument and result.
 
@@ -45,8 +49,10 @@ def runs_last(
         differentiable_as: arithmetic with the same values from which derivatives are taken; the kernel unless given. A
             kernel that branches on all runs at once, by `where_any`, needs one, since it cannot be mapped over runs.
         shapes: shapes of the results as a function of the arguments; without it the kernel is traced to find them.
+        written: the same arithmetic entry by entry, for native code; the kernel unless given.
     """
-    this = _Kernel(kernel, kernel if differentiable_as is None else differentiable_as)
+    source = kernel if differentiable_as is None else differentiable_as
+    this = _Kernel(kernel, source, kernel if written is None else written)
 
     @wraps(kernel)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -94,7 +94,7 @@ def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     params = equation.params
     numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
     kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True))
-    tree, function = params["tree"], params["kernel"].function
+    tree, function = params["tree"], params["kernel"].written
     key = (function, tree, kinds)
     if key not in lowering.kernels:
         lowering.kernels[key] = jax.make_jaxpr(

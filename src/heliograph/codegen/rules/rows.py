@@ -74,31 +74,37 @@ def like_row(equation: JaxprEqn, **params: Any) -> Any:
 
 
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Loop over the first batch axis; without batch axes, over the first free axis of the left argument."""
+    """Loop over the first batch axis, else the first free axis of the left argument, else that of the right one."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    if not is_long(inputs):
+    to_number = not result_shape(equation) and all(x.size <= LARGE for x in inputs)
+    if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     a, b = (in_memory(lowering, x) for x in inputs)
+    free_left, free_right = (
+        next((d for d in range(x.ndim) if d not in axes), None) for x, axes in ((a, left), (b, right))
+    )
+    in_left, in_right = (left_batch[0], right_batch[0]) if left_batch else (free_left, None)
+    if in_left is None:
+        in_right = free_right
+    if in_left is None and in_right is None:
+        raise Unsupported("a sum of products over a long array")
     # Dimension numbers of one row: without the axis that is looped over.
-    if left_batch:
-        a, b = _first(a, left_batch[0]), _first(b, right_batch[0])
-        numbers = (
-            (_without(left, left_batch[0]), _without(right, right_batch[0])),
-            (_without(left_batch[1:], left_batch[0]), _without(right_batch[1:], right_batch[0])),
+    numbers = tuple(
+        tuple(
+            axes if gone is None else _without(axes, gone) for axes, gone in zip(pair, (in_left, in_right), strict=True)
         )
-    else:
-        free = next((d for d in range(a.ndim) if d not in left), None)
-        if free is None:
-            raise Unsupported("a sum of products over a long array")
-        a, numbers = _first(a, free), ((_without(left, free), right), ((), ()))
+        for pair in ((left, right), (left_batch[1:], right_batch[1:]))
+    )
+    a, b = (x if axis is None else _first(x, axis) for x, axis in ((a, in_left), (b, in_right)))
     # The operation on one row, in a loop.
     row_equation = like_row(equation, dimension_numbers=numbers)
 
     def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        rows = [a.row(row), b.row(row) if left_batch else b]
+        rows: list[Value] = [x if axis is None else x.row(row) for x, axis in ((a, in_left), (b, in_right))]
         return as_nodes(lowering, ([], list(lowering.equation(row_equation, rows))))
 
-    return list(repeated(lowering, a.shape[0], [], turn)[1])
+    count = (b if in_left is None else a).shape[0]
+    return list(repeated(lowering, count, [], turn)[1])
 
 
 def _first(x: InMemory, axis: int) -> InMemory:

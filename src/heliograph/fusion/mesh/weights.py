@@ -5,11 +5,11 @@ import jax.numpy as jnp
 
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.lapack import regular_solve
-from heliograph.numerics.linalg import add, diagonal_of, identity, symmetric, written_solver
+from heliograph.numerics.linalg import add, diagonal_of, identity, psd_solve, solve, symmetric
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Bool, Float
 
-SHORT = 24  # unknowns of equations that are solved side by side, operation by operation
+SHORT = 24  # unknowns of equations that are solved side by side
 RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have on top of its own
 
 
@@ -32,12 +32,9 @@ def arrived_weights(
     total = scaled + jnp.diag(jnp.repeat(jnp.where(present, RIDGE, 1.0), n))
     ones = (there[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
-    solved = _short_solve(total, ones) if degree * n <= SHORT else regular_solve(total, ones)
+    solved = psd_solve(total, ones) if degree * n <= SHORT else regular_solve(total, ones)
     weights = (inverse(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
-
-
-_short_solve = runs_last(lambda a, b: written_solver(a)(b))
 
 
 def arrived_weights_by_component(
@@ -71,7 +68,7 @@ def component_weights(
     mean = jnp.sum(there * diagonal_of(component) / jnp.sum(there, axis=0), axis=0)
     apart = jnp.where(there > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
     total = there[:, None] * there * component + identity(degree, component) * apart[:, None]
-    solved = written_solver(total)(there * jnp.ones_like(mean))
+    solved = solve(total, (there * jnp.ones_like(mean))[:, None])[:, 0]
     return solved / jnp.sum(solved, axis=0)
 
 
