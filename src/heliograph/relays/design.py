@@ -163,9 +163,9 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     """Raise ValueError for a design with other moments at k = 0 than the network, as a periodic one has."""
-    start = start_moments(network)
-    if design.moments[0].shape != start.shape or not np.allclose(design.moments[0], start, rtol=1e-9, atol=0.0):
-        periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(*design.moments[[0, -1]], rtol=1e-6)
+    expected, start = start_moments(network), design.moments[0]
+    if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
+        periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
         got = "a periodic one (use given_design with its gains repeated)" if periodic else "one from another start"
         raise fail("design", "one from the network's start on", got)
 

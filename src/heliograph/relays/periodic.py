@@ -202,7 +202,7 @@ def _solve_steady(
     def again(carry: SteadyState) -> SteadyState:
         value, _, count = carry
         after = period(value)
-        size = jnp.maximum(jnp.max(jnp.abs(after)), jnp.finfo(float).tiny)
+        size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
         return after, jnp.max(jnp.abs(after - value)) / size, count + 1
 
     def going(carry: SteadyState) -> jax.Array:
