@@ -17,6 +17,7 @@ from heliograph.codegen.lowering import like
 from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.collector import no_collector
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 
@@ -107,7 +108,8 @@ def attempted(make: Callable[[], Code]) -> Code | None:
     if engine == "xla" or _available() is not None:
         return None
     try:
-        return make()
+        with no_collector():
+            return make()
     except Unsupported as error:
         if engine == "native":
             raise fail("native code", "a program of operations that it takes", str(error)) from None
@@ -156,6 +158,7 @@ class _Array(NamedTuple):
 
 
 @lru_cache(COMPILED)
+@no_collector()
 def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]

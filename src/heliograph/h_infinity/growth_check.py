@@ -73,6 +73,11 @@ class GrowthFinding(NamedTuple):
         return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
 
     @property
+    def around_zero(self) -> bool:
+        """True if 0 is in the box: slopes then bound f itself too."""
+        return bool(np.all(self.low <= 0) and np.all(self.high >= 0))
+
+    @property
     def refuted(self) -> bool:
         """True if a pair, a slope or f(0) breaks the constant."""
         steep = self.differences and not self.slope <= self.limit
@@ -120,7 +125,8 @@ def check_growth(
     Norms of Jacobians by automatic differentiation at 4,096 points of a Sobol sequence, then random moves of shrinking
     size from the steepest. Pairs start close together along the steepest directions, and far apart, and move likewise.
     A box is convex, so in it the largest slope is the smallest true constant. Where f is written in operations that
-    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box.
+    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box. A box
+    with 0 in it then proves |f(x)| <= a |x| too.
 
     Args:
         function: f, from (n,) to (m,) or a number, written with jax.numpy.

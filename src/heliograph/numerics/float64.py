@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.collector import no_collector
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it
@@ -59,7 +60,8 @@ def _compiled(function: Callable[P, R], options: Callable[[], Options], donate: 
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return jitted()(*args, **kwargs)
+        with no_collector():  # a first call traces
+            return jitted()(*args, **kwargs)
 
     return call
 

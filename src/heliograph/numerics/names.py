@@ -8,6 +8,8 @@ from typing import NoReturn
 
 import lazy_loader
 
+from heliograph.numerics.collector import no_collector
+
 MOST = 3  # names that are offered
 ALIKE = 0.7  # as difflib measures it, so that neess offers nees and foo nothing
 MEANT = {  # what others call it, in plain letters
@@ -24,7 +26,8 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
 
     def attribute(name: str) -> object:
         if name in names or name.startswith("_"):
-            return load(name)
+            with no_collector():
+                return load(name)
         raise AttributeError(f"{package} has no attribute {name!r}{offered(name, _public(package, names))}")
 
     return attribute, listed, names

@@ -1,0 +1,21 @@
+"""Python's garbage collector, off while modules are imported and functions traced, which keep nearly all they make."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def no_collector() -> Iterator[None]:
+    """Switch the collector of reference cycles off within the block or the decorated function, then on if it was on.
+
+    It would look at all that lives again and again: a third of the time of importing JAX and of tracing a program.
+    Threads may overlap: the one that found it on switches it on again, so that it never stays off.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
