@@ -16,14 +16,15 @@ from heliograph.live.plant import Plant
 from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.check import instance, shown
+from heliograph.numerics.collector import no_collector
+from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.lines import EstimateWriter, line
 from heliograph.serving.message import AnyMessage, Message, Payload, read_messages
 from heliograph.serving.output import Output
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
-LARGE, MANY = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
+LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
 WHY: dict[Verdict, str] = {
     "duplicate": "held already",
@@ -77,24 +78,17 @@ class Service:
         Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
         Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
         """
-        enabled = gc.isenabled()
-        gc.disable()  # a batch makes many objects and no cycles, and a search would take half its time
-        try:
-            return self._take(payloads or self._silence(datetime.now(UTC)))
-        finally:
-            if enabled:
-                self._collect_again(len(payloads))
-
-    def _collect_again(self, count: int) -> None:
-        """Go on with garbage collection; objects of a large batch are old then, and searched once in MANY messages."""
-        if count > LARGE:
-            gc.freeze()
-            gc.unfreeze()
-            self._unsearched += count
-        gc.enable()
-        if self._unsearched > MANY:
-            self._unsearched = 0
-            gc.collect()
+        with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
+            outputs = self._take(payloads or self._silence(datetime.now(UTC)))
+            # What a large batch made counts as old, and is searched for garbage once in a million messages.
+            if len(payloads) > LARGE:
+                gc.freeze()
+                gc.unfreeze()
+                self._unsearched += len(payloads)
+            if self._unsearched > MILLION:
+                self._unsearched = 0
+                gc.collect()
+        return outputs
 
     def _silence(self, now: datetime) -> list[Message]:
         """Return that nothing came by now, for plants whose steps have dates: inputs that all stay as they were."""
@@ -168,6 +162,7 @@ class Service:
     def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
+        # Messages of damaged plants are refused; all others are used.
         for message, payload, outcome in zip(messages, payloads, self._using.use(messages, self._damage), strict=True):
             plant, verdict, why, notes = outcome
             if plant is not None:

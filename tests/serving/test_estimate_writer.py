@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.lanes import Lanes
-from heliograph.serving.lines import HEAD, EstimateWriter, line
+from heliograph.serving.estimate_writer import HEAD, EstimateWriter, line
 from tests.losing import Losing
 from tests.serving.worlds import fleet, stepping
 
@@ -19,10 +19,10 @@ def stepped() -> Lanes:
 def weighed() -> Lanes:
     """A filter that weighs its two numbers, one that claims nothing, and names full of signs."""
     plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
-    both, one = hg.LinearSensor(np.eye(2), 0.1), hg.LinearSensor([[1.0, 0.0]], 0.1)
+    both, position = hg.LinearSensor(np.eye(2), 0.1), hg.LinearSensor([[1.0, 0.0]], 0.1)
     robust = hg.robust_filter(plant, both, hg.perfect(2), hg.filters.Gate(30.0))
     nodes = {'a "%d"': hg.Node(both, hg.perfect(2), {"100 %b": robust})}
-    return Lanes(hg.Network(plant, nodes | {"b": hg.Node(one, hg.perfect(), {"level": Losing(claim="none")})}))
+    return Lanes(hg.Network(plant, nodes | {"b": hg.Node(position, hg.perfect(), {"level": Losing(claim="none")})}))
 
 
 @pytest.mark.parametrize("lanes", [stepped, pytest.param(weighed, marks=pytest.mark.slow)])
