@@ -162,15 +162,15 @@ class Service:
     def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
-        # Messages of damaged plants are refused; all others are used.
         for message, payload, outcome in zip(messages, payloads, self._using.use(messages, self._damage), strict=True):
             plant, verdict, why, notes = outcome
             if plant is not None:
                 touched[plant.name] = plant
-            # Verdicts: used, as most are; not read; known already, or refused with the reason.
+            # Used, as most are.
             if verdict == "used" and not notes and not isinstance(message, str):
                 used.add(message.plant)
                 continue
+            # Of a damaged plant, or not read.
             if not isinstance(message, str) and message.plant in self._damage:
                 entries.append(_refusal(message, "damaged", self._damage[message.plant]))
                 continue
@@ -179,6 +179,7 @@ class Service:
                 said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
                 entries.append(_refused(None, {}, "malformed", said))
                 continue
+            # Used but for some of it, known already, or refused with the reason.
             if verdict == "used":
                 used.add(message.plant)
             else:
