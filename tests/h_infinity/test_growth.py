@@ -107,6 +107,22 @@ def test_a_stopped_slope_proves_nothing():
     assert slope_bound(lambda x: x * jax.lax.stop_gradient(2.0), -np.ones(1), np.ones(1), 2.0).value <= 2 + 1e-9
 
 
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (lambda x: np.sin(x), "one that calls NumPy or math"),
+        (lambda x: x if x[0] > 0 else -x, "one that decides by a value"),
+        (lambda x: None, "got TypeError"),
+        (lambda x, y: x, "missing 1 required positional argument"),
+        (lambda x: x[None], "got 2 axes"),
+    ],
+)
+def test_a_function_that_cannot_be_traced_is_refused_in_one_line(function, got):
+    with pytest.raises(ValueError, match=r"function: expected one of the state in operations of jax\.numpy") as raised:
+        check_growth(function, 1.0, [-1.0], [1.0])
+    assert got in str(raised.value) and "\n" not in str(raised.value)
+
+
 def growing(constant, of_output=0.0):
     system = hg.h_infinity.growth_system(
         6, [[0.1]], [[0.2]], [[1.0]], hg.hop(1.0, 0.01), constant, of_output, output=[[1.0]], initial_weight=5.0

@@ -10,7 +10,7 @@ from scipy.stats import qmc
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
-from heliograph.numerics.check import array, check_seed, fail, scalar
+from heliograph.numerics.check import array, check_seed, fail, scalar, shown_error
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import readable
@@ -144,7 +144,7 @@ def check_growth(
     """
     bottom, top = _check_box(constant, low, high)
     seed = check_seed("seed", seed)
-    check_callable("function", function, "the state")
+    _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
@@ -165,6 +165,18 @@ def check_growth(
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
     pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
     return _finding(name, constant, bottom, top, tools, points, pairs, True)
+
+
+def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
+    """Raise ValueError unless a number or a vector follows from a point."""
+    expected = "one of the state in operations of jax.numpy that returns a number or a vector"
+    try:
+        with jax.enable_x64(True):
+            axes = len(jax.eval_shape(lambda x: jnp.atleast_1d(function(x)), point).shape)
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("function", expected, shown_error(error)) from error
+    if axes != 1:
+        raise fail("function", expected, f"{axes} axes")
 
 
 def _check_box(
