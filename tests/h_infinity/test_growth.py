@@ -98,9 +98,34 @@ def test_what_cannot_be_followed_is_assumed_and_says_so(function, reason):
     assert result.value == np.inf and reason in result.reason
 
 
-def growing(constant):
+def test_a_stopped_slope_proves_nothing():
+    def spike(x):
+        return 0.5 * x + 0.4 * jax.lax.stop_gradient(jnp.exp(-(((x - 0.3) / 1e-12) ** 2)))
+
+    finding = check_growth(spike, 0.5, [-1.0], [1.0])
+    assert not finding.refuted and not finding.proved and "a slope that is stopped" in finding.text
+    assert slope_bound(lambda x: x * jax.lax.stop_gradient(2.0), -np.ones(1), np.ones(1), 2.0).value <= 2 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (lambda x: np.sin(x), "one that calls NumPy or math"),
+        (lambda x: x if x[0] > 0 else -x, "one that decides by a value"),
+        (lambda x: None, "got TypeError"),
+        (lambda x, y: x, "missing 1 required positional argument"),
+        (lambda x: x[None], "got 2 axes"),
+    ],
+)
+def test_a_function_that_cannot_be_traced_is_refused_in_one_line(function, got):
+    with pytest.raises(ValueError, match=r"function: expected one of the state in operations of jax\.numpy") as raised:
+        check_growth(function, 1.0, [-1.0], [1.0])
+    assert got in str(raised.value) and "\n" not in str(raised.value)
+
+
+def growing(constant, of_output=0.0):
     system = hg.h_infinity.growth_system(
-        6, [[0.1]], [[0.2]], [[1.0]], hg.hop(1.0, 0.01), constant, output=[[1.0]], initial_weight=5.0
+        6, [[0.1]], [[0.2]], [[1.0]], hg.hop(1.0, 0.01), constant, of_output, output=[[1.0]], initial_weight=5.0
     )
     return system, hg.h_infinity.horizon_design(system)
 
@@ -126,6 +151,22 @@ def test_a_certificate_says_what_it_rests_on_and_refuses_what_does_not_fit():
     assert not false.certified and "f(0)" in false.text
     only_size = certificate(check_growth(lambda x: 0.7 * jnp.sin(x), 0.7, [-5.0], [5.0], differences=False))
     assert only_size.certified and not only_size.assumed  # its slopes are bounded as well
+    # f grows by 100 between 0 and a box, in which its slopes are small: differences alone are proved.
+    step = check_growth(lambda x: jnp.clip(100 * x, 0, 0.9) + 0.1 * jnp.maximum(x - 1, 0), 0.7, [1.0], [2.0])
+    assert step.proved and certificate(step).assumed == ("|f(x)| <= a |x| with a = 0.7",)
+
+
+@pytest.mark.slow
+def test_a_finding_is_about_one_function():
+    system, design = growing(0.5, 0.2)
+    parts = design.gains, design.weights, design.multipliers, design.level
+    of_f = check_growth(lambda x: 0.5 * jnp.sin(x), 0.5, [-5.0], [5.0])
+    of_h = check_growth(lambda x: 0.2 * jnp.sin(x), 0.2, [-5.0], [5.0], name="h")
+    assert all("h(x)" in what for what in certify_level(system, *parts, [of_f]).assumed)
+    assert all("f(x)" in what for what in certify_level(system, *parts, output_growth=[of_h]).assumed)
+    both = certify_level(system, *parts, [of_f], [of_h])
+    assert both.certified and not both.assumed and both.growth == (of_f, of_h)
+    assert not certify_level(system, *parts, output_growth=[of_f]).certified  # .5 is more than h is given
 
 
 def test_weights_that_are_not_symmetric_are_refused():

@@ -92,3 +92,19 @@ def test_the_start_is_the_largest_allowed_also_where_x_and_e_are_weighed_togethe
     recursive = recursive_design(of, 1.2 * design.level, search=False)
     np.testing.assert_allclose(recursive.weights[0], recursive.level**2 * weight, rtol=1e-6)
     assert certify_level(of, recursive.gains, recursive.weights, recursive.multipliers, recursive.level).certified
+
+
+@pytest.mark.slow
+def test_noise_counts_in_the_units_of_each_output():
+    """The noise of an output in units 1e8 times larger is none to the rounding of the others."""
+
+    def measured_in(unit):
+        link = hg.hop(1.0, np.diag([1.0, 0.04 * unit**2]))
+        output, transition = np.diag([1.0, unit]), 0.9 * np.eye(2)
+        given = {"transition": transition, "output": output, "initial_weight": 100.0}
+        return hg.h_infinity.growth_system(5, [[0.1], [0.2]], np.zeros((2, 1)), np.eye(2), link, 0.0, **given)
+
+    plain, fine = horizon_design(measured_in(1.0)), horizon_design(measured_in(1e-8))
+    assert fine.level == pytest.approx(plain.level, rel=1e-5)  # the solver's
+    unknown = certify_level(measured_in(1e-8), fine.gains, fine.weights, fine.multipliers, 0.9 * fine.level)
+    assert not unknown.certified

@@ -1,5 +1,6 @@
 """The steady state, against the recursion run long enough and against the figures found by other means."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -8,8 +9,10 @@ from heliograph.model.channel import hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
+from heliograph.model.sensor import LinearSensor
+from heliograph.random_affine.law import Rayleigh
 from heliograph.relays.descent import bfgs
-from heliograph.relays.design import given_design, local_error_design, receiver_behind_relays
+from heliograph.relays.design import given_design, local_error_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (
     periodic_behind_relays,
     periodic_given_design,
@@ -71,6 +74,49 @@ def test_without_relays_it_is_the_linear_filter():
         state, estimate = filter_.step(state, np.zeros(1), (), k)
     assert relative(steady, estimate.covariance) < 1e-8
     assert np.trace(steady) == pytest.approx(1.0790e-6, rel=1e-4)
+
+
+def taking_turns(noise=0.3):
+    """A relay that listens in one slot and transmits in the next, in which alone the receiver receives."""
+    plant, sensor = LinearPlant([[0.8]], noise, [2.0], 1.0), LinearSensor([[1.0]], 0.1)
+    first, second = hop(Rayleigh(0.9), 0.05), hop(Rayleigh(0.7), 0.05)
+    return RelayNetwork(plant, sensor, ("relay",), ({"relay": {"sensor": first}}, {"receiver": {"relay": second}}))
+
+
+@pytest.mark.slow
+def test_a_receiver_that_receives_nothing_in_some_slot():
+    net = taking_turns()
+    design = periodic_local_error_design(net)
+    behind = periodic_behind_relays(net, design.gains)
+    times = {name: np.tile(gain, (60, 1, 1)) for name, gain in design.gains.items()}
+    long = receiver_behind_relays(net, times).gains.covariance[-2:]
+    np.testing.assert_allclose(behind, long, rtol=1e-11)  # the rounding of a linear solve
+    # Behind one relay the receiver's own best next error is that of the best linear receiver.
+    np.testing.assert_allclose(behind, design.covariance["receiver"][1:], rtol=1e-11)
+    # Limits hold for slots in which relays send; 0 in the first, in which none does, forbids nothing.
+    limit = 1.2 * design.total_power()
+    loud = periodic_receiver_error_design(net, power_limit=limit)
+    assert limit[0] == 0 < limit[1]
+    assert np.sum(loud.trace("receiver")[1:]) < 0.993 * np.sum(design.trace("receiver")[1:])  # measured: .9915
+    np.testing.assert_allclose(loud.total_power(), limit, rtol=3e-5)  # the search aims 1e-5 below
+
+
+def test_a_plant_without_noise_comes_to_rest():
+    design = periodic_local_error_design(taking_turns(noise=0.0))
+    assert all(np.all(covariance == 0) for covariance in design.covariance.values())
+
+
+def test_a_periodic_design_is_no_schedule_from_the_start(local):
+    """Its covariances are those after long, not those of the first period."""
+    net = example()
+    with pytest.raises(ValueError, match=r"the network's start on, got a periodic one \(use given_design"):
+        relay_schedules(net, local)
+    other = RelayNetwork(eqx.tree_at(lambda p: p.initial_covariance, net.plant, 4 * np.eye(3)), net.sensor, net.relays,
+                         net.slots)  # fmt: skip
+    with pytest.raises(ValueError, match="the network's start on, got one from another start"):
+        relay_schedules(other, local_error_design(net, 3))
+    repeated = {name: np.tile(gain, (2, 1, 1)) for name, gain in local.gains.items()}
+    assert {s.horizon for s in relay_schedules(net, given_design(net, repeated)).values()} == {4}
 
 
 def test_what_has_no_steady_state_is_refused(local):

@@ -222,6 +222,8 @@ def test_bad_input_is_refused(designed, quietly):
     ):
         short = relay_schedules(quiet(), quietly)["a"]
         Network.of_relays(net, {**schedules, "relay_1": short}, receivers)
+    with pytest.raises(ValueError, match="schedule of 'relay_1': expected a Schedule, got 1"):
+        Network.of_relays(net, {**schedules, "relay_1": 1}, receivers)
     with pytest.raises(ValueError, match="horizon: expected at most 20 steps"):
         monte_carlo(Network.of_relays(net, schedules, receivers), 21, 10, 0)
     with pytest.raises(ValueError, match="runs: expected a positive whole number"):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
-from heliograph.h_infinity.system import GrowthSystem, smallest_eigenvalue, symmetric_weight
+from heliograph.h_infinity.system import Growth, GrowthSystem, smallest_eigenvalue, symmetric_weight
 from heliograph.numerics.check import array, fail, instance, items, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -59,6 +59,7 @@ def certify_level(
     multipliers: "Float[ArrayLike, 'steps count']",
     level: float,
     growth: "Sequence[GrowthFinding]" = (),
+    output_growth: "Sequence[GrowthFinding]" = (),
 ) -> "HInfinityCertificate":
     """Check that gains K guarantee an H-infinity level, given weights P and multipliers that are meant to prove it.
 
@@ -72,7 +73,9 @@ def certify_level(
         weights: P_0 ... P_steps (steps + 1, 2n, 2n), of the stacked (x, e).
         multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~.
         level: gamma, a positive ratio of norms.
-        growth: results of `check_growth`; constants that none of them proves are listed as assumed (default none).
+        growth: results of `check_growth` about f; constants that none of them proves are listed as assumed (default
+            none).
+        output_growth: the same about h (default none).
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
@@ -80,7 +83,7 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level))
-    growth = [instance("growth", finding, GrowthFinding, FINDINGS) for finding in items("growth", growth, FINDINGS)]
+    findings = {"f": _findings("growth", growth), "h": _findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)
@@ -103,21 +106,27 @@ def certify_level(
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
-    constants = _constants(system)
-    reasons += _against(constants, growth)
+    assumed: list[str] = []
+    for letter, of in (("f", system.growth), ("h", system.output_growth)):
+        reasons += _against(of, findings[letter])
+        assumed += _assumed(letter, of, findings[letter])
     count = T if negative.all() else int(np.argmin(negative))
-    findings = tuple(growth), tuple(reasons), _assumed(constants, growth)
-    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *findings)
+    about = tuple(findings["f"] + findings["h"]), tuple(reasons), tuple(assumed)
+    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *about)
 
 
-def _against(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> list[str]:
+def _findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
+    return [instance(name, finding, GrowthFinding, FINDINGS) for finding in items(name, given, FINDINGS)]
+
+
+def _against(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
     """Reasons against a certificate: refuted constants, and findings about constants that the system does not have."""
-    reasons = []
-    for finding in growth:
+    reasons, constants = [], _positive(growth.state) + _positive(growth.error)
+    for finding in findings:
         if finding.refuted:
             reasons.append(finding.text)
-        elif not any(_supports(finding, value) for value, _ in constants):
-            known = ", ".join(sorted({f"{value:g}" for value, _ in constants})) or "none"
+        elif not any(_supports(finding, value) for value in constants):
+            known = ", ".join(sorted({f"{value:g}" for value in constants})) or "none"
             reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
     return reasons
 
@@ -127,24 +136,28 @@ def _supports(finding: GrowthFinding, constant: float) -> bool:
     return finding.constant <= constant * (1 + TOLERANCE)
 
 
-def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
-    """List the growth constants that are not zero, without repetition, with the inequality of each."""
-    results: dict[tuple[float, str], None] = {}
-    for letter, growth in (("f", system.growth), ("h", system.output_growth)):
-        for what, values in ((f"|{letter}(x)| <= a |x|", growth.state), ("", growth.error)):
-            whole = what or f"|{letter}(x) - {letter}(y)| <= a |x - y|"
-            results |= {(float(value), whole): None for value in values if value > 0}
-    return list(results)
+def _positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
+    """List the constants that are not zero, without repetition, in their order."""
+    return list(dict.fromkeys(float(value) for value in constants if value > 0))
 
 
-def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> tuple[str, ...]:
-    """List the constants that no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
+def _assumed(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
+    """List a function's constants that no finding proves.
+
+    A bound of the slopes in a box bounds differences in it, and with f(0) = 0 and 0 in the box the function itself.
+    """
+    around_zero = [finding for finding in findings if finding.around_zero]
+    itself, differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
     assumed = []
-    for value, what in constants:
-        about = [finding for finding in growth if _supports(finding, value)]
-        if not about or not all(finding.proved for finding in about):
-            assumed.append(f"{what} with a = {value:g}")
-    return tuple(assumed)
+    for constants, what, relevant in (
+        (growth.state, itself, around_zero),
+        (growth.error, differences, findings),
+    ):
+        for value in _positive(constants):
+            about = [finding for finding in relevant if _supports(finding, value)]
+            if not about or not all(finding.proved for finding in about):
+                assumed.append(f"{what} with a = {value:g}")
+    return assumed
 
 
 def theorem_matrix(

@@ -10,7 +10,7 @@ from scipy.stats import qmc
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
-from heliograph.numerics.check import array, check_seed, fail, scalar
+from heliograph.numerics.check import array, check_seed, fail, scalar, shown_error
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import readable
@@ -73,6 +73,11 @@ class GrowthFinding(NamedTuple):
         return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
 
     @property
+    def around_zero(self) -> bool:
+        """True if 0 is in the box: slopes then bound f itself too."""
+        return bool(np.all(self.low <= 0) and np.all(self.high >= 0))
+
+    @property
     def refuted(self) -> bool:
         """True if a pair, a slope or f(0) breaks the constant."""
         steep = self.differences and not self.slope <= self.limit
@@ -120,7 +125,8 @@ def check_growth(
     Norms of Jacobians by automatic differentiation at 4,096 points of a Sobol sequence, then random moves of shrinking
     size from the steepest. Pairs start close together along the steepest directions, and far apart, and move likewise.
     A box is convex, so in it the largest slope is the smallest true constant. Where f is written in operations that
-    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box.
+    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box. A box
+    with 0 in it then proves |f(x)| <= a |x| too.
 
     Args:
         function: f, from (n,) to (m,) or a number, written with jax.numpy.
@@ -138,7 +144,7 @@ def check_growth(
     """
     bottom, top = _check_box(constant, low, high)
     seed = check_seed("seed", seed)
-    check_callable("function", function, "the state")
+    _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
@@ -159,6 +165,18 @@ def check_growth(
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
     pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
     return _finding(name, constant, bottom, top, tools, points, pairs, True)
+
+
+def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
+    """Raise ValueError unless a number or a vector follows from a point."""
+    expected = "one of the state in operations of jax.numpy that returns a number or a vector"
+    try:
+        with jax.enable_x64(True):
+            axes = len(jax.eval_shape(lambda x: jnp.atleast_1d(function(x)), point).shape)
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("function", expected, shown_error(error)) from error
+    if axes != 1:
+        raise fail("function", expected, f"{axes} axes")
 
 
 def _check_box(

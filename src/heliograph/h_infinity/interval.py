@@ -34,7 +34,10 @@ class Interval(NamedTuple):
 
 
 def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
-    """Evaluate a traced function on intervals; `continuous` refuses an open decision, where the function may jump."""
+    """Evaluate a traced function on intervals.
+
+    `continuous`: refuse an open decision, where the function may jump, and a stopped slope, which its derivative lacks.
+    """
     values: dict[core.Var, Interval] = {}
 
     def read(atom: core.Var | core.Literal) -> Interval:
@@ -51,6 +54,8 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
             results = evaluate(inner, inputs, continuous)
         elif name == "mul" and equation.invars[0] is equation.invars[1]:
             results = [_square(inputs[0])]
+        elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):
+            raise UnknownError("a slope that is stopped")
         elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):  # whole numbers are not rounded
             results = _moved(equation, inputs)
         else:

@@ -14,7 +14,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, fold
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack
 
-ROUNDING = 1e-13  # relative to the largest eigenvalue of a covariance: smaller ones are zero up to rounding
+ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding
 
 
 class DisturbedGain(NamedTuple):
@@ -41,24 +41,25 @@ class DisturbedGain(NamedTuple):
     def spreads(self) -> np.ndarray:
         """Matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
 
-        They are the eigenvectors of the covariance of H's entries, times the roots of their eigenvalues; as many as its
-        rank, so none where nothing is random.
+        They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
+        eigenvalues; as many as its rank, so none where nothing is random.
 
         Shapes: (rank, m, c).
         """
         m, c = self.mean.shape
-        values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c))
-        largest = max(float(np.max(np.abs(self.second), initial=0.0)), float(np.max(values, initial=0.0)))
-        used = values > ROUNDING * largest
-        factors: np.ndarray = (np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
+        size = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
+        unit = np.where(size > 0, size, 1.0)  # each entry in units of its own: rounding is relative to these
+        values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c) / np.outer(unit, unit))
+        used = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
+        factors: np.ndarray = (unit[:, None] * np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
         return factors
 
 
 def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
     """Joint moments of a channel's gain and of the gains of its noise sources, in the order of the signal's way.
 
-    A noise of covariance R counts as rank(R) sources of unit size; its mean is not used. Uncertain probabilities count
-    as nominal.
+    A noise of covariance R counts as rank(R) sources of unit size, and its mean as their disturbance: a mean that they
+    cannot make is refused. Uncertain probabilities count as nominal.
     """
     gain: DisturbedGain = fold(channel, {
         GainAndNoise: lambda hop, _: _of_hop(hop),
@@ -70,10 +71,16 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
 
 
 def _of_hop(channel: GainAndNoise) -> DisturbedGain:
-    values, vectors = np.linalg.eigh(np.asarray(channel.noise.covariance))
+    covariance = np.asarray(channel.noise.covariance)
+    unit = standard_deviations(covariance)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
     used = values > ROUNDING * np.max(values, initial=0.0)
-    root = np.sqrt(values[used]) * vectors[:, used]
+    root = unit[:, None] * np.sqrt(values[used]) * vectors[:, used]
     root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
+    mean = np.asarray(channel.noise.mean) / unit
+    if np.any(np.abs(mean - vectors[:, used] @ (vectors[:, used].T @ mean)) > SYMMETRY_TOLERANCE * np.abs(mean).max()):
+        got = np.asarray(channel.noise.mean).tolist()
+        raise fail("noise of an H-infinity design", "a mean that its covariance can make", got)
     scaled = np.concatenate([np.asarray(channel.matrix), np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(np.asarray(channel.matrix)), root], axis=1)
     first, second = float(channel.law.moment(1)), float(channel.law.moment(2))
@@ -214,7 +221,8 @@ def growth_system(
         disturbance: B (n, v).
         feedthrough: D (y, v).
         target: M (z, n), of the error that a level bounds.
-        channel: the channel from the sensor to the filter, or an `OverTime` of channels.
+        channel: the channel from the sensor to the filter, or an `OverTime` of channels; uncertain probabilities count
+            as nominal.
         growth: constant of f, or a pair (of f itself, of its differences) where these differ; a number or an
             `OverTime`.
         output_growth: constant or constants of h in the same way; 0 by default.

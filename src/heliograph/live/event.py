@@ -38,7 +38,7 @@ class Known(NamedTuple):
     node_index: int
     sequence: int
     time: float
-    values: Float[np.ndarray, " size"]
+    values: list[float]  # NaN where one did not arrive
     arrival: float
 
     @property

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from itertools import pairwise
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +78,7 @@ class Fleet:
         self.end_step = np.inf if covered is None else covered - 1
         self._leap = options.leap if alone or self.lanes.dt is not None else min(options.leap, FAR)
         self._joint = self.lanes.dt is None or network.common is not None
+        self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
         # Nodes whose sender decides when to send.
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
         deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
@@ -120,7 +122,8 @@ class Fleet:
         if len(values) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
-        return Known(index, sequence, time, np.array(values, dtype=np.float64), arrival)
+        numbers = [nan if value is None else value for value in values]
+        return Known(index, sequence, time, numbers, arrival)
 
     def check_step(self, name: str, time: float) -> None:
         """Refuse a time that is no step of the network, where time counts steps."""
@@ -128,15 +131,26 @@ class Fleet:
             end = "" if self.end_step == np.inf else f" to {self.end_step:g}"
             raise fail(name, f"a step, a whole number from 0{end}", f"{time} ({OF_STEPS})")
 
+    def within(self, node: str, event: Known) -> tuple[Known, int, str]:
+        """Remove an event's values beyond the limits of its node; return how many these are, and which, in words."""
+        if node not in self._limits:
+            return event, 0, ""
+        limits, values = self._limits[node], np.array(event.values)
+        if not (outside := limits.outside(values)).any():
+            return event, 0, ""
+        said = limits.why(values, self.network.nodes[node].received_names)
+        return event._replace(values=np.where(outside, nan, values).tolist()), int(outside.sum()), said
+
     def take(self, plant: Plant, event: Known) -> Verdict:
         """Judge an event and hold it if it is used."""
         if event.time > plant.now + self._leap:
             return "future"
         rows, now = plant.rows, max(plant.now, event.arrival)
-        verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
+        key = rows.key(event)
+        verdict = rows.verdict(event, key, now - self.options.window, self.options.ahead)
         if verdict != "used":
             return verdict
-        plant.take(event, self.pool.take, self.width)
+        plant.take(event, key, self.pool.take, self.width)
         plant.now = now
         return verdict
 
@@ -156,9 +170,9 @@ class Fleet:
     def step(self, plants: Iterable[Plant]) -> None:
         """Step what is due, for all plants at once."""
         chains = [chain for plant in plants if (chain := plant.chain())]
-        for chain in chains:
-            slots = [row.slot for row in chain]
-            self.pool.table[slots, self.pool.numbers] = np.array([row.numbers for row in chain])
+        if rows := [row for chain in chains for row in chain]:
+            numbers = np.array([number for row in rows for number in row.numbers]).reshape(len(rows), -1)
+            self.pool.table[[row.slot for row in rows], self.pool.numbers] = numbers
         self._run(chains)
 
     def _run(self, chains: Sequence[list[HeldRow]]) -> None:
@@ -183,10 +197,9 @@ class Fleet:
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
         return self.pool.trial(np.array(slots), given, self.end_step)
 
-    def outputs(self, slots: list[int]) -> list[list[float]]:
+    def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
         """Return the outputs of the filters after the rows in these slots."""
-        results: list[list[float]] = self.pool.table[slots, self.pool.outputs].tolist() if slots else []
-        return results
+        return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 
     def senders(self, plant: Plant) -> dict[str, SenderStatus]:
         """Return the status of each sender of a plant that decides when to send: what its silence means by now."""

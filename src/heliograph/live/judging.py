@@ -1,7 +1,7 @@
 """Plausibility of the events of a batch: an event is implausible if no filter of its node could use it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,13 +17,7 @@ from heliograph.simulation.network import FUSED
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
-class Candidate(NamedTuple):
-    """An event that was used, the number of its message, and its row."""
-
-    message: int
-    plant: Plant
-    event: Known
-    row: HeldRow
+Candidate: TypeAlias = tuple[int, Plant, Known, HeldRow]  # an event that was used, its message's number, and its row
 
 
 class Judges:
@@ -61,25 +55,26 @@ class Judges:
             return {}
         # Most rows raise no flag: look at the parts of a judgement only where one is raised.
         pool = self.fleet.pool
-        outputs = pool.table[[candidate.row.slot for candidate in taken], pool.outputs]
-        flagged = (outputs[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
+        slots = np.array([row.slot for *_, row in taken])
+        flagged = (pool.table[slots[:, None], pool.outputs.start + self._every[:, FLAGS].ravel()] > 0).any(axis=1)
         # Reasons by candidate; by plant the first of its implausible inputs.
         reasons, spoilt = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
-            event, plant = taken[i].event, taken[i].plant.name
+            (_, plant, event, _), outputs = taken[i], pool.table[slots[i], pool.outputs]
             if event.node_index >= 0:
-                why = why_values(outputs[i][self._columns[event.node_index]]) if _size(event) >= 0 else None
-            elif why := self.why_inputs(outputs[i]):
-                first = spoilt.setdefault(plant, i)
-                spoilt[plant] = min(first, i, key=lambda j: taken[j].row.key)
+                why = why_values(outputs[self._columns[event.node_index]]) if _size(event) >= 0 else None
+            elif why := self.why_inputs(outputs):
+                first = spoilt.setdefault(plant.name, i)
+                spoilt[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
             if why:
                 reasons[i] = why
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
-            node_of_row = taken[i].row.slot, taken[i].event.node_index
-            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j].event))
-        first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i].plant.name, i) == i}
+            _, _, event, row = taken[i]
+            node_of_row = row.slot, event.node_index
+            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j][2]))
+        first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i][1].name, i) == i}
         return {i: why for i, why in first_of_plant.items() if i in largest.values()}
 
 

@@ -3,13 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import NamedTuple
-
-import numpy as np
+from typing import TypeAlias
 
 from heliograph.live.event import Known, Verdict
-from heliograph.live.rows import HeldRow, Rows
-from heliograph.numerics.types import Float
+from heliograph.live.rows import HeldRow, Key, Rows
 
 
 @dataclass
@@ -47,6 +44,9 @@ class Link:
         setattr(self, verdict, getattr(self, verdict) + 1)
         if verdict == "used":
             self.latest = max(self.latest, time)
+            if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
+                self.newest, self.at = sequence, time
+                return
         if verdict in ("duplicate", "conflict"):
             return
         if verdict in ("future", "implausible"):  # its time may be wrong: it says nothing of the order
@@ -68,11 +68,8 @@ class Link:
             self.lost -= self.lost > 0  # it had only been overtaken
 
 
-class Change(NamedTuple):
-    """A row that took an event, with its numbers and events before; None if the row is new."""
-
-    row: HeldRow
-    before: tuple[Float[np.ndarray, " size"], dict[tuple[int, int, float], Float[np.ndarray, " values"]]] | None
+# A row that took an event, with its numbers and events before; None if the row is new.
+Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
 
 
 @dataclass
@@ -99,17 +96,18 @@ class Plant:
     dirty: int | None = None
     forced: int = 0
     links: dict[str, Link] = field(default_factory=dict)
-    changes: list["Change"] = field(default_factory=list)
+    changes: list[Change] = field(default_factory=list)
 
-    def take(self, event: Known, slot: Callable[[], int], width: int) -> None:
-        """Add an event to its row, or to a new row in a slot of its own; record the change for `undo`."""
-        index, row = self.rows.find(event)
+    def take(self, event: Known, key: Key, slot: Callable[[], int], width: int) -> None:
+        """Add an event to the row with its key, or to a new row in a slot of its own; record the change for `undo`."""
+        index, row = self.rows.find(key)
         if row is None:
-            row = HeldRow(self.rows.key(event), slot(), width)
-            self.rows.insert(index, row)
-            self.changes.append(Change(row, None))
+            row = HeldRow(key, slot(), width)
+            self.rows.keys.insert(index, key)
+            self.rows.held.insert(index, row)
+            self.changes.append((row, None))
         else:
-            self.changes.append(Change(row, (row.numbers.copy(), dict(row.events))))
+            self.changes.append((row, (row.numbers.copy(), dict(row.events))))
         self.rows.fill(row, event)
         self.dirty = index if self.dirty is None else min(self.dirty, index)
 
@@ -121,7 +119,7 @@ class Plant:
                 self.rows.remove(self.rows.index(row.key))
                 slots.append(row.slot)
             else:
-                row.numbers[:], row.events = before
+                row.numbers, row.events = before
         index = min((self.rows.index(row.key) for row, _ in self.changes), default=len(self.rows.held))
         self.dirty = index if index < len(self.rows.held) else None
         self.changes = []

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -32,9 +33,7 @@ class PlantParts(NamedTuple):
 
     def to_bytes(self) -> bytes:
         """Serialise: lengths of the parts, then the parts."""
-        head = json.dumps(self.head).encode()
-        numbers = [np.asarray(a, dtype=kind).tobytes() for a, kind in zip(self[1:], TYPES, strict=True)]
-        return b"".join([HEAD.pack(len(head), len(self.keys), len(self.events), len(self.values)), head, *numbers])
+        return _joined(self.head, *(array.ravel() for array in self[1:]))
 
     @staticmethod
     def of(data: bytes, width: int) -> "PlantParts":
@@ -53,19 +52,23 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     rows = plant.rows.held
     origin = None if plant.origin is None else plant.origin.isoformat()
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
-    events = [(i, name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
-    return PlantParts(
-        head={"now": plant.now, "forced": plant.forced, "origin": origin, "links": links},
-        keys=_integers([number for row in rows for number in row.key[1:]], 2),
-        events=_integers([number for i, name, _ in events for number in (i, name[0], name[1])], 3),
-        table=fleet.pool.table[[row.slot for row in rows]],
-        times=np.array([name[2] for _, name, _ in events]),
-        values=np.concatenate([np.zeros(0), *(values for _, _, values in events)]),
-    ).to_bytes()
+    names = [(i, *name) for i, row in enumerate(rows) for name in row.events]
+    return _joined(
+        {"now": plant.now, "forced": plant.forced, "origin": origin, "links": links},
+        [number for row in rows for number in row.key[1:]],
+        [number for i, node, sequence, _ in names for number in (i, node, sequence)],
+        fleet.pool.table[[row.slot for row in rows]].ravel(),
+        [time for *_, time in names],
+        [value for row in rows for values in row.events.values() for value in values],
+    )
 
 
-def _integers(flat: list[int], width: int) -> np.ndarray:
-    return np.array(flat, dtype=np.int64).reshape(-1, width)
+def _joined(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
+    """Serialise the head and the flat parts of a plant behind their lengths."""
+    text = json.dumps(head).encode()
+    counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
+    numbers = [np.array(a, dtype=kind).tobytes() for a, kind in zip(flat, TYPES, strict=True)]
+    return b"".join([HEAD.pack(len(text), *counts), text, *numbers])
 
 
 def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
@@ -76,7 +79,7 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     begin = 0
     for time, (i, node, sequence) in zip(times.tolist(), events.tolist(), strict=True):
         end = begin + fleet.size(node)
-        rows[i].events[node, sequence, time] = values[begin:end]
+        rows[i].events[node, sequence, time] = values[begin:end].tolist()
         begin = end
     held = fleet.rows(rows[0])
     held.hold(rows)
@@ -88,7 +91,6 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
 def _row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:
     slot = fleet.pool.take()
     fleet.pool.table[slot] = numbers
-    values = numbers[fleet.pool.numbers]
-    row = HeldRow((float(values[-1]), node, sequence), slot, len(values) - 1)
-    row.numbers[:] = values
+    row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)
+    row.numbers = numbers[fleet.pool.numbers].tolist()
     return row

@@ -1,12 +1,12 @@
 """Events in order of time: the rows that they form, which rows are final, and the verdict on a new event."""
 
 from bisect import bisect_left
+from math import inf, nan
 from typing import TypeAlias
 
 import numpy as np
 
 from heliograph.live.event import Known, Verdict
-from heliograph.numerics.types import Float
 
 Key: TypeAlias = "tuple[float, int, int]"  # of a row: time, place of the node (-1: inputs), sequence
 BEFORE = -2  # the place of what stands before everything at its time
@@ -15,15 +15,17 @@ BEFORE = -2  # the place of what stands before everything at its time
 class HeldRow:
     """A row of the history: its slot, its numbers (measurements of all nodes, inputs, time), and its events."""
 
+    __slots__ = "events", "key", "numbers", "slot"
+
     def __init__(self, key: Key, slot: int, size: int):
-        self.key, self.slot, self.numbers = key, slot, np.empty(size + 1)
-        self.numbers.fill(np.nan)
-        self.numbers[-1] = key[0]
-        self.events: dict[tuple[int, int, float], Float[np.ndarray, " size"]] = {}
+        self.key, self.slot = key, slot
+        self.numbers = [nan] * size
+        self.numbers.append(key[0])
+        self.events: dict[tuple[int, int, float], list[float]] = {}
 
     def has_data(self) -> bool:
         """Return whether the row has an event of a node; its other events are inputs."""
-        return any(node >= 0 for node, _, _ in self.events)
+        return bool(self.events) and max(self.events)[0] >= 0
 
 
 class Rows:
@@ -51,16 +53,16 @@ class Rows:
 
     def after(self, time: float) -> int:
         """Return the index of the first row after a time."""
-        return bisect_left(self.keys, (time, np.inf))
+        return bisect_left(self.keys, (time, inf))
 
-    def verdict(self, event: Known, watermark: float, ahead: float) -> Verdict:
-        """Judge an event, for this watermark."""
+    def verdict(self, event: Known, key: Key, watermark: float, ahead: float) -> Verdict:
+        """Judge an event of the row with this key, for this watermark."""
         if event.time > event.arrival + ahead:
             return "future"
-        if self.key(event) > self.keys[-1]:  # as most are: nothing can be said against what is newest
+        if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
         base = self.finalise(watermark)[0]
-        index, row = self.find(event)
+        index, row = self.find(key)
         held = None if row is None else row.events.get(event.name)
         if index < base or (index == base and held is None):
             return "late"
@@ -69,21 +71,15 @@ class Rows:
         if held is not None:
             return "duplicate" if np.array_equal(held, event.values, equal_nan=True) else "conflict"
         there = row.numbers[self.places[event.node_index]]
-        return "conflict" if np.any(~np.isnan(there) & ~np.isnan(event.values)) else "used"
+        return "conflict" if any(a == a and b == b for a, b in zip(there, event.values, strict=True)) else "used"
 
-    def find(self, event: Known) -> tuple[int, HeldRow | None]:
-        """Return the index of the event's row, and the row if it exists."""
-        key = self.key(event)
+    def find(self, key: Key) -> tuple[int, HeldRow | None]:
+        """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
         index = bisect_left(self.keys, key)
         there = self.keys[index] == key
         return index, self.held[index] if there else None
-
-    def insert(self, index: int, row: HeldRow) -> None:
-        """Insert a row at the index that `find` returned."""
-        self.keys.insert(index, row.key)
-        self.held.insert(index, row)
 
     def index(self, key: Key) -> int:
         """Return the index of the row with this key, or the index at which it would be inserted."""
@@ -95,11 +91,10 @@ class Rows:
 
     def fill(self, row: HeldRow, event: Known) -> None:
         """Write an event's values into its row; NaN is left out."""
-        there = row.numbers[self.places[event.node_index]]
-        if row.events:
-            np.copyto(there, event.values, where=~np.isnan(event.values))
-        else:  # nothing is there yet
-            there[:] = event.values
+        at, values = self.places[event.node_index], event.values
+        if row.events:  # else nothing is there yet
+            values = [there if new != new else new for there, new in zip(row.numbers[at], values, strict=True)]
+        row.numbers[at] = values
         row.events[event.name] = event.values
 
     def finalise(self, watermark: float) -> tuple[int, int]:

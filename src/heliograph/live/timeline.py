@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.judging import Candidate, Judges
+from heliograph.live.judging import Judges
 from heliograph.live.lanes import shared_lanes
 from heliograph.live.plant import Link
 from heliograph.live.plant_codec import plant_bytes, plant_from
@@ -150,12 +150,12 @@ class Timeline:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        event, dropped = self._within(self._known(node, sequence, time, values, arrival), node)
+        event, dropped, _ = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
         plant, before = self._plant, self._plant.now
         verdict = self._fleet.take(plant, event)
         if verdict == "used":
             nothing = dropped and np.isnan(event.values).all()
-            if nothing or self._refuses(event, plant.changes[-1].row):
+            if nothing or self._refuses(event, plant.changes[-1][0]):
                 # As if it had never arrived.
                 verdict = "implausible"
                 self._fleet.undo(plant, before)
@@ -168,19 +168,11 @@ class Timeline:
             link.dropped += dropped
         return verdict
 
-    def _within(self, event: Known, node: str) -> tuple[Known, int]:
-        """Remove an event's values beyond its node's limits; return the event and how many these were."""
-        limits = None if node == INPUTS else self.network.nodes[node].limits
-        outside = None if limits is None else limits.outside(event.values)
-        if outside is None or not outside.any():
-            return event, 0
-        return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum())
-
     def _refuses(self, event: Known, row: HeldRow) -> bool:
         """Step what an event changed; is it implausible? Inputs are also judged over one unit of time after them."""
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
-        refused = bool(self._judges.implausible([Candidate(0, plant, event, row)]))
+        refused = bool(self._judges.implausible([(0, plant, event, row)]))
         if not refused and event.node_index < 0 and self._lanes.dt is not None:
             after = fleet.pool.trial(np.array([row.slot]), np.full((1, self._lanes.given), np.nan), np.inf)
             refused = self._judges.why_inputs(after[0]) is not None
@@ -282,7 +274,7 @@ class Timeline:
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
         came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
-        return Known(index, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
+        return Known(index, whole(f"{name}, sequence", sequence), at, numbers(name, values, size).tolist(), came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""

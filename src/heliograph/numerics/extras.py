@@ -23,6 +23,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "dask": "cluster",
     "distributed": "cluster",
     "gym_electric_motor": "motor",
+    "msgspec": "live",
     "pydantic": "live",
     "pydantic_core": "live",
     "sqlalchemy": "live",

@@ -128,15 +128,16 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
     Args:
         network: relays that filter.
-        design: of this network.
+        design: of this network, from its start on: of a periodic one take `given_design` with its gains repeated.
 
     Raises:
-        ValueError: a design of another network.
+        ValueError: a design of another network, a periodic one.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     instance("design", design, RelayDesign, "a RelayDesign")
     if set(design.gains) != set(network.filters):
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
+    _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
     rows, constants = expected_maps(steps)
     # Moments of (eta+ before correction, innovation): predicted and innovation covariances.
@@ -158,6 +159,15 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         arrays = Gains(*moved, *moved, expected, constant, *believed)
         schedules[name] = Schedule(arrays, network.initial()[0], given_bounds("exact", network))
     return schedules
+
+
+def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
+    """Raise ValueError for a design with other moments at k = 0 than the network, as a periodic one has."""
+    expected, start = start_moments(network), design.moments[0]
+    if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
+        periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
+        got = "a periodic one (use given_design with its gains repeated)" if periodic else "one from another start"
+        raise fail("design", "one from the network's start on", got)
 
 
 @compiled

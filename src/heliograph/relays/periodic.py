@@ -13,6 +13,7 @@ from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import (
@@ -149,7 +150,7 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
 
     def best(spread: jax.Array, at_slot: RelaySide) -> tuple[jax.Array, jax.Array]:
         z = predict(spread, at_slot)
-        gain = jnp.linalg.solve(z[d:, d:], z[d:, :d]).T
+        gain = psd_solve(z[d:, d:], z[d:, :d]).T  # zero in a slot in which nobody transmits to the receiver
         after = z[:d, :d] - gain @ z[d:, :d]
         return (after + after.T) / 2, gain
 
@@ -201,7 +202,8 @@ def _solve_steady(
     def again(carry: SteadyState) -> SteadyState:
         value, _, count = carry
         after = period(value)
-        return after, jnp.max(jnp.abs(after - value)) / jnp.max(jnp.abs(after)), count + 1
+        size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
+        return after, jnp.max(jnp.abs(after - value)) / size, count + 1
 
     def going(carry: SteadyState) -> jax.Array:
         return (carry[1] > tolerance) & (carry[2] < PERIODS)
@@ -278,6 +280,7 @@ def _tune(
     # Scaled gains x, and a multiplier for the power of each slot.
     slots = len(network.slots)
     limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
+    limit = np.where(steps.talks[:, 1:].any(axis=1), limit, np.inf)  # silent relays send nothing, whatever they may
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")

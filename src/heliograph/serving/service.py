@@ -2,83 +2,30 @@
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
-from math import isfinite
+from itertools import repeat
 from time import perf_counter
 from typing import NamedTuple
 
-from pydantic_core import to_json
-
-from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, Verdict
 from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.lanes import FilterColumns, WeighedAt
 from heliograph.live.lanes import Lanes as Lanes
 from heliograph.live.plant import Plant
 from heliograph.live.plant_codec import plant_bytes, plant_from
-from heliograph.live.senders import SenderStatus
-from heliograph.numerics.check import InputError, instance, shown
+from heliograph.live.rows import HeldRow
+from heliograph.numerics.check import instance, shown
+from heliograph.numerics.collector import no_collector
+from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
-from heliograph.serving.message import Message, Payload, read_message
+from heliograph.serving.message import AnyMessage, Message, Payload, read_messages
 from heliograph.serving.output import Output
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
-
-class OutputWriter:
-    """Writer of a network's outputs as lines of JSON; numbers that are not finite become null."""
-
-    def __init__(self, lanes: Lanes):
-        self._n = len(lanes.network.states)
-        self._nodes: dict[str, list[FilterColumns]] = {}
-        for columns in lanes.places:
-            self._nodes.setdefault(columns.node, []).append(columns)
-
-    def estimates(
-        self, kind: str, plant: str, time: float | str, outputs: list[float], senders: Mapping[str, SenderStatus]
-    ) -> bytes:
-        """Return a line with the estimates of all filters after a row, from its outputs, and the senders."""
-        results = {
-            node: {columns.filter: self._filter(columns, outputs) for columns in places}
-            for node, places in self._nodes.items()
-        }
-        parts: dict[str, object] = {"kind": kind, "plant": plant, "time": time, "estimates": results}
-        if senders:
-            parts["senders"] = {name: status._asdict() | {"dead": status.dead} for name, status in senders.items()}
-        return line(parts)
-
-    def _filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
-        n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
-        # Estimate, without a claim where it is no number.
-        covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
-        numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
-        negative = columns.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
-        claim = columns.claim if numbers and not negative else "none"
-        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
-        # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
-        if columns.tested is not None:
-            nis, received = (outputs[column] for column in columns.tested)
-            return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
-        if judged is None:
-            return results
-        if columns.weighed is not None:
-            parts = zip(WeighedAt._fields, columns.weighed, strict=True)
-            results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
-        if outputs[judged.reason] > 0:
-            why = in_words(outputs[judged.reason], outputs[judged.distance])
-            return results | {"nis": None, "received": 0, "implausible": why}
-        return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
-
-
-def line(parts: dict[str, object]) -> bytes:
-    """Encode a value as one line of JSON, without the newline."""
-    return to_json(parts, inf_nan_mode="null")
-
-
+LARGE, MILLION = 1000, 1_000_000  # messages of a batch; between two searches for garbage among what such batches made
 ROWS = 200_000  # held in memory before the plants with the oldest messages leave it for the store
 WHY: dict[Verdict, str] = {
     "duplicate": "held already",
@@ -120,8 +67,9 @@ class Service:
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
-        self._writer, self._using = OutputWriter(fleet.lanes), Using(fleet, self.plants)
+        self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
         self._exchange = Exchange(fleet, self._moment)
+        self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
@@ -131,8 +79,17 @@ class Service:
         Nothing in a message stops the service: a message that cannot be used is counted and refused, with the reason.
         Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
         """
-        with _without_collection():
-            return self._take(payloads or self._silence(datetime.now(UTC)))
+        with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
+            outputs = self._take(payloads or self._silence(datetime.now(UTC)))
+            # What a large batch made counts as old, and is searched for garbage once in a million messages.
+            if len(payloads) > LARGE:
+                gc.freeze()
+                gc.unfreeze()
+                self._unsearched += len(payloads)
+            if self._unsearched > MILLION:
+                self._unsearched = 0
+                gc.collect()
+        return outputs
 
     def _silence(self, now: datetime) -> list[Message]:
         """Return that nothing came by now, for plants whose steps have dates: inputs that all stay as they were."""
@@ -158,15 +115,16 @@ class Service:
 
     def _take(self, payloads: Sequence[Payload]) -> list[Output]:
         begun = perf_counter()
-        messages = [_read(payload) for payload in payloads]
-        self._load({message.plant for message in messages if isinstance(message, Message)})
+        messages = read_messages(payloads)
+        names = {message.plant for message in messages if not isinstance(message, str)}
+        self._load(names)
         # If another process has committed one of the plants, read it again and repeat.
         while True:
             try:
                 outputs, committed = self._taken(messages, payloads)
                 break
             except ConflictError:
-                self._load({message.plant for message in messages if isinstance(message, Message)})
+                self._load(names)
         took = perf_counter() - begun
         # Age of the oldest message.
         dates = [
@@ -202,28 +160,25 @@ class Service:
         self.fleet.forget(finalised)
         return self._commit({}, entries, 0)
 
-    def _taken(self, messages: Sequence[Message | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
+    def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
-        # Messages of damaged plants are refused; all others are used.
-        damage = [self._damage.get(m.plant) if isinstance(m, Message) else None for m in messages]
-        outcomes = iter(self._using.use([m for m, why in zip(messages, damage, strict=True) if why is None]))
-        for message, payload, damaged in zip(messages, payloads, damage, strict=True):
-            if isinstance(message, Message) and damaged is not None:
-                entries.append(_refusal(message, "damaged", damaged))
+        entries, malformed, known, outcomes = list[Entry](), 0, 0, self._using.use(messages, self._damage)
+        touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
+        used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
+        # All but those that were used as they are, as most were.
+        for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
+            message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
+            # Of a damaged plant, or not read.
+            if not isinstance(message, str) and message.plant in self._damage:
+                entries.append(_refusal(message, "damaged", self._damage[message.plant]))
                 continue
-            plant, verdict, why, notes = next(outcomes)
             if isinstance(message, str) or verdict is None:
                 malformed += 1
                 said = why if isinstance(payload, str) else f"{why}: {shown(payload)}"
                 entries.append(_refused(None, {}, "malformed", said))
                 continue
-            # Verdicts: used, known already, or refused with the reason.
-            if plant is not None:
-                touched[plant.name] = plant
-            if verdict == "used":
-                used.add(message.plant)
-            else:
+            # Used but for some of it, known already, or refused with the reason.
+            if verdict != "used":
                 known += verdict in ("duplicate", "late")
                 entries.append(_refusal(message, verdict, why or WHY[verdict]))
             entries += [_refusal(message, "implausible", note) for note in notes]
@@ -242,7 +197,7 @@ class Service:
         self.known += known
         return outputs + sent + provisional, committed
 
-    def _warn(self, message: Message, why: str) -> None:
+    def _warn(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message, once."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
@@ -285,23 +240,25 @@ class Service:
     def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
         rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
-        outputs = self.fleet.outputs([row.slot for _, row in rows])
-        return [
-            Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
-            for (plant, row), numbers in zip(rows, outputs, strict=True)
-        ]
+        names = (plant.name for plant, _ in rows)
+        return [*map(Entry._make, zip(names, repeat("final"), self._lines(b"final", rows)))]
 
     def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
-        """Return the provisional estimates at the newest rows."""
-        outputs = self.fleet.outputs([row.newest.slot for row in finalised])
-        return [
-            Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
-            for (plant, _, newest, _), numbers in zip(finalised, outputs, strict=True)
-        ]
+        """Return the provisional estimates at the newest rows, and what the senders' silence means."""
+        rows = [(row_set.plant, row_set.newest) for row_set in finalised]
+        outputs = []
+        for (plant, _), body in zip(rows, self._lines(b"provisional", rows), strict=True):
+            if self.fleet.deciding:
+                senders = {name: status._asdict() | {"dead": status.dead}
+                           for name, status in self.fleet.senders(plant).items()}  # fmt: skip
+                body = b'%b,"senders":%b}' % (body[:-1], line(senders))
+            outputs.append(Output(None, plant.name, "provisional", body))
+        return outputs
 
-    def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
-        senders = self.fleet.senders(plant) if kind == "provisional" else {}
-        return self._writer.estimates(kind, plant.name, self._moment(plant, at), outputs, senders)
+    def _lines(self, kind: bytes, rows: Sequence[tuple[Plant, HeldRow]]) -> list[bytes]:
+        moments = [(plant.name, row.key[0] if plant.origin is None else self._moment(plant, row.key[0]))
+                   for plant, row in rows]  # fmt: skip
+        return self._writer.lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
     def _moment(self, plant: Plant, at: float) -> float | str:
         """Return the time of a row as messages have it."""
@@ -309,29 +266,7 @@ class Service:
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()
 
 
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """Pause garbage collection: a batch makes many objects and no cycles, and a search would take half its time."""
-    before = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if before:
-            gc.enable()
-
-
-def _read(payload: Payload) -> Message | str:
-    """Parse a message, or return the reason why it is malformed."""
-    if not isinstance(payload, bytes):
-        return payload
-    try:
-        return read_message(payload)
-    except InputError as error:
-        return str(error)
-
-
-def _refusal(message: Message, why: str, detail: str) -> Entry:
+def _refusal(message: AnyMessage, why: str, detail: str) -> Entry:
     moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
     parts = {"node": message.node, "sequence": message.sequence, "time": moment}
     return _refused(message.plant, parts, why, detail)

@@ -1,11 +1,10 @@
 """Use of a batch without its implausible messages: their plants are restored, and take the rest again."""
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Container, Sequence
 from datetime import UTC, datetime, time
 from math import floor
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -14,19 +13,12 @@ from heliograph.live.fleet import Fleet
 from heliograph.live.judging import Candidate, Judges
 from heliograph.live.plant import Link, Plant
 from heliograph.numerics.check import InputError
-from heliograph.serving.message import Message, seconds
+from heliograph.serving.message import AnyMessage, seconds
 
-
-class Outcome(NamedTuple):
-    """Result of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason.
-
-    `notes`: parts of a used message that were left out.
-    """
-
-    plant: Plant | None
-    verdict: Verdict | None
-    why: str = ""
-    notes: tuple[str, ...] = ()
+# Of a message: its plant (None if it began none), a verdict (None if it could not be read), the reason, and notes on
+# parts that were left out of a used message.
+Outcome: TypeAlias = tuple[Plant | None, Verdict | None, str, Sequence[str]]
+NOTHING: Outcome = None, None, "", ()
 
 
 class Before(NamedTuple):
@@ -34,7 +26,7 @@ class Before(NamedTuple):
 
     known: bool
     now: float
-    links: dict[str, Link]
+    links: dict[str, tuple[Any, ...]]
 
 
 class Using:
@@ -42,27 +34,34 @@ class Using:
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, Plant]):
         self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
-        network = fleet.network
-        self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
-        self._names = {name: network.nodes[name].received_names for name in self._limits}
         self._refused: dict[tuple[int, bool], str] = {}  # why, by the number of a message and whether it is its inputs
         self._before: dict[str, Before] = {}
         self._taken: list[Candidate] = []
 
-    def use(self, messages: Sequence[Message | str]) -> list[Outcome]:
-        """Give messages to their plants and step these; return the outcome of each message.
+    def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str]) -> list[Outcome]:
+        """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
 
         Afterwards the plants are as if the messages refused as implausible had never arrived.
         """
         self._refused = self._implausible_inputs(messages)
-        outcomes: dict[int, Outcome] = {}
-        left = list(range(len(messages)))
+        outcomes = [NOTHING] * len(messages)
+        # One plant after another, whose memory is near then; the messages of a plant in their order.
+        by_plant: dict[str, list[int]] = {}
+        for i, message in enumerate(messages):
+            name = "" if isinstance(message, str) else message.plant
+            if name not in damaged or isinstance(message, str):
+                by_plant.setdefault(name, []).append(i)
+        left = [i for numbers in by_plant.values() for i in numbers]
         # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
         while left:
             self._before, self._taken = {}, []
             for i in left:
-                outcomes[i] = self._outcome(i, messages[i])
-            self.fleet.step(list({candidate.plant.name: candidate.plant for candidate in self._taken}.values()))
+                try:
+                    message = messages[i]
+                    outcomes[i] = (None, None, message, ()) if isinstance(message, str) else self._use(i, message)
+                except InputError as error:
+                    outcomes[i] = None, None, str(error), ()
+            self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
             implausible = self._judges.implausible(self._taken)
             # Plants that an implausible message has spoilt go back.
             spoilt = set()
@@ -72,67 +71,64 @@ class Using:
                 spoilt.add(plant.name)
             for name in spoilt:
                 self._undo(name)
-            left = [i for i in left if isinstance(message := messages[i], Message) and message.plant in spoilt]
-        return [outcomes[i] for i in range(len(messages))]
+            left = [i for i in left if not isinstance(message := messages[i], str) and message.plant in spoilt]
+        self._taken = []
+        return outcomes
 
-    def _implausible_inputs(self, messages: Sequence[Message | str]) -> dict[tuple[int, bool], str]:
+    def _implausible_inputs(self, messages: Sequence[AnyMessage | str]) -> dict[tuple[int, bool], str]:
         """Return the inputs that lead to no valid prediction from the state before the batch."""
-        given = [(i, message, message.values if message.node == INPUTS else message.inputs)
-                 for i, message in enumerate(messages) if isinstance(message, Message)]  # fmt: skip
-        given = [(i, m, values) for i, m, values in given if values and len(values) == self.fleet.lanes.given]
+        given = [(i, m, values) for i, m in enumerate(messages) if not isinstance(m, str)
+                 and (values := m.values if m.node == INPUTS else m.inputs)
+                 and len(values) == self.fleet.lanes.given]  # fmt: skip
         plants = [self.plants.get(message.plant) for _, message, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
         why = self._judges.implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
 
-    def _outcome(self, number: int, message: Message | str) -> Outcome:
-        try:
-            if isinstance(message, str):
-                raise InputError(message)
-            return self._use(number, message)
-        except InputError as error:
-            return Outcome(None, None, str(error))
-
-    def _use(self, number: int, message: Message) -> Outcome:
+    def _use(self, number: int, message: AnyMessage) -> Outcome:
         """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
         plant = self.plants.get(message.plant)
         # A new plant begins with a message that is plausible and of a right clock.
         origin = self._origin(message) if plant is None else plant.origin
-        at = self._number(message.time, origin, message.plant)
+        at = message.time
+        if origin is not None or not isinstance(at, float):
+            at = self._number(at, origin, message.plant)
         now = at if plant is None else plant.now
         arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
         # Values beyond limits do not count as received; an event of such values only is implausible.
-        event, dropped, beyond = self._within(message.node, event)
-        why = self._refused.get((number, event.node_index < 0)) or (beyond if np.isnan(event.values).all() else "")
-        spoilt = self._refused.get((number, True)) if inputs is not None else None
+        event, dropped, beyond = self.fleet.within(message.node, event)
+        refused, why, spoilt = self._refused, beyond if beyond and np.isnan(event.values).all() else "", None
+        if refused:
+            why = refused.get((number, event.node_index < 0)) or why
+            spoilt = refused.get((number, True)) if inputs is not None else None
         if plant is None:
             if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
-                return Outcome(None, "future")
+                return None, "future", "", ()
             if why and (inputs is None or spoilt):
-                return Outcome(None, "implausible", why)
+                return None, "implausible", why, ()
             plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
             self._before[plant.name] = Before(False, at, {})
         elif plant.name not in self._before:
-            links = {name: replace(link) for name, link in plant.links.items()}
+            links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
             self._before[plant.name] = Before(True, plant.now, links)
         # Inputs and measurement are used or refused independently.
-        notes = []
+        notes: list[str] = []
         if inputs is not None and spoilt is None:
             self._take(number, plant, inputs)
         elif spoilt is not None:
             plant.link(INPUTS).implausible += 1
             notes.append(f"inputs {given}: {spoilt}; the rest is used")
-        verdict = "implausible" if why else self._take(number, plant, event)
+        verdict: Verdict = "implausible" if why else self._take(number, plant, event)
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at)
-        if verdict in ("used", "implausible"):
+        if dropped and verdict in ("used", "implausible"):
             link.dropped += dropped
-        if verdict == "used" and beyond:
+        if beyond and verdict == "used":
             notes.append(f"{beyond}; the rest is used")
-        return Outcome(plant, verdict, why, tuple(notes))
+        return plant, verdict, why, notes
 
     def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
         """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
@@ -142,27 +138,19 @@ class Using:
     def _take(self, number: int, plant: Plant, event: Known) -> Verdict:
         verdict = self.fleet.take(plant, event)
         if verdict == "used":
-            self._taken.append(Candidate(number, plant, event, plant.changes[-1].row))
+            self._taken.append((number, plant, event, plant.changes[-1][0]))
         return verdict
-
-    def _within(self, node: str, event: Known) -> tuple[Known, int, str]:
-        """Remove an event's values beyond the limits of its node; return how many these are, and which, in words."""
-        limits = self._limits.get(node)
-        if limits is None or not (outside := limits.outside(event.values)).any():
-            return event, 0, ""
-        said = limits.why(event.values, self._names[node])
-        return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum()), said
 
     def _undo(self, name: str) -> None:
         """Restore a plant to its state before the batch."""
         plant, (known, now, links) = self.plants[name], self._before[name]
         if known:
             self.fleet.undo(plant, now)
-            plant.links = links
+            plant.links = {name: Link(*counts) for name, counts in links.items()}
         else:
             self.fleet.end(self.plants.pop(name))
 
-    def _origin(self, message: Message) -> datetime | None:
+    def _origin(self, message: AnyMessage) -> datetime | None:
         """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
         if not isinstance(message.time, datetime):
             return None

@@ -183,11 +183,12 @@ class Network(Module):
         filters: dict[str, dict[str, AbstractFilter]] = {}
         n = len(relays.states)
         for name, size in zip(relays.relays, relays.received, strict=False):
+            check_type(f"schedule of {name!r}", schedules[name], Schedule)
             shape = schedules[name].gains.direct.shape[1:]
             if shape != (n, size):
                 raise fail(f"schedule of {name!r}", f"gains of shape {(n, size)}", f"shape {shape}")
             filters[name] = {LOCAL: ScheduledFilter(schedules[name])}
-        filters[RECEIVER] = dict(receivers)
+        filters[RECEIVER] = table("receiver's filters", receivers, "filters")
         check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
         # All places receive sums of hops.

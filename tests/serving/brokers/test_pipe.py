@@ -153,3 +153,35 @@ def test_a_reader_that_went_away_ends_the_service():
         asyncio.run(keep_running(Counting(), Pipe(source, target)))
     for end in (source, sender, target):
         os.close(end)
+
+
+def test_a_sender_that_is_ahead_fills_a_batch_and_a_reader_gets_all_of_it():
+    """More than a pipe holds is one batch in, and out through a pipe that stays one that waits."""
+    (source, sender), (reader, target) = os.pipe(), os.pipe()
+    sent, known = b"m\n" * 100_000, []
+
+    async def echo():
+        pipe = Pipe(source, target)
+        batch = await pipe.receive()
+        await pipe.publish([Output(None, "", "provisional", body) for body in batch.payloads])
+        return len(batch.payloads)
+
+    def send():
+        view = memoryview(sent)[65_536:]
+        with suppress(BrokenPipeError):
+            while view:
+                view = view[os.write(sender, view) :]
+
+    os.write(sender, sent[:65_536])  # what a pipe holds
+    with os.fdopen(reader, "rb") as answers:
+        threads = [Thread(target=send), Thread(target=lambda: known.append(answers.read()))]
+        for thread in threads:
+            thread.start()
+        count = asyncio.run(echo())
+        assert os.get_blocking(target)
+        os.close(source)
+        os.close(target)
+        for thread in threads:
+            thread.join()
+    os.close(sender)
+    assert 32_768 <= count <= 100_000 and known == [sent[: 2 * count]]

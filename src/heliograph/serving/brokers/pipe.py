@@ -2,7 +2,10 @@
 
 import asyncio
 import os
-from collections.abc import Callable, Sequence
+import select
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from heliograph.disk.whole_file import naming
 from heliograph.serving.brokers.translator import Translator
@@ -10,7 +13,8 @@ from heliograph.serving.brokers.transport import Batch, nothing
 from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
-READ = 1 << 18  # bytes that are read at once
+READ = 1 << 20  # bytes of a batch
+FULL, MORE = 1 << 15, 2  # bytes of a pipe whose sender is ahead, so that we wait for more; for so many milliseconds
 AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
@@ -34,7 +38,7 @@ class Pipe:
         while True:
             await _ready(self.source, loop.add_reader, loop.remove_reader)
             with naming("standard input"):
-                data = os.read(self.source, READ)
+                data = self._read()
             lines = self._lines(data)
             if self._translator is None:
                 payloads: list[Payload] = list(lines)
@@ -45,6 +49,16 @@ class Pipe:
             if not data:
                 return None
 
+    def _read(self) -> bytes:
+        """Read what is there; of a sender that is ahead also what it sends next."""
+        data = more = os.read(self.source, READ)
+        waiting = select.poll()
+        waiting.register(self.source, select.POLLIN)
+        while more and FULL <= len(data) < READ and waiting.poll(MORE):
+            more = os.read(self.source, READ - len(data))
+            data += more
+        return data
+
     def _lines(self, data: bytes) -> list[bytes]:
         """Return the lines that are complete with these bytes; at the end of the file, the incomplete last one."""
         *lines, rest = (self._rest + data).split(b"\n") if data else [self._rest, b""]
@@ -53,7 +67,7 @@ class Pipe:
             self._skipping = False
         if len(rest) > LONGEST:
             if not self._skipping:
-                lines.append(rest)
+                lines.append(rest[: LONGEST + 1])
             rest, self._skipping = b"", True
         self._rest = rest
         return [line for line in lines if line.strip()]
@@ -61,13 +75,31 @@ class Pipe:
     async def publish(self, outputs: Sequence[Output]) -> None:
         rest = memoryview(b"".join([output.body + b"\n" for output in outputs]))
         loop = asyncio.get_running_loop()
-        while rest:
-            await _ready(self.target, loop.add_writer, loop.remove_writer)
-            with naming("standard output"):
-                rest = rest[os.write(self.target, rest[:AT_ONCE]) :]
+        with _without_waiting(self.target) as (target, at_once):
+            while rest:
+                await _ready(target, loop.add_writer, loop.remove_writer)
+                with naming("standard output"), suppress(BlockingIOError):
+                    rest = rest[os.write(target, rest[:at_once]) :]
 
     async def close(self) -> None:
         """Do nothing: whoever opened the files closes them."""
+
+
+@contextmanager
+def _without_waiting(file: int) -> Iterator[tuple[int, int | None]]:
+    """Yield a descriptor to write to, and the number of bytes that it takes without waiting; None for any number.
+
+    A pipe is opened again, since whether it waits is a property that all who opened it share.
+    """
+    mode, again = os.fstat(file).st_mode, None
+    if stat.S_ISFIFO(mode):
+        with suppress(OSError):
+            again = os.open(f"/proc/self/fd/{file}", os.O_WRONLY | os.O_NONBLOCK)
+    try:
+        yield (file, None if stat.S_ISREG(mode) else AT_ONCE) if again is None else (again, None)
+    finally:
+        if again is not None:
+            os.close(again)
 
 
 async def _ready(file: int, add: Callable[[int, Callable[[], None]], None], remove: Callable[[int], object]) -> None:

@@ -8,6 +8,7 @@ from sqlalchemy.exc import ArgumentError
 
 from heliograph.numerics.check import fail, text
 
+PAGES = "page_size=16384", "cache_size=-16384"  # bytes, of a new database; kB of pages in memory, as large commits have
 PLACE = "a file, or a URL as postgresql://host/database"
 
 
@@ -46,7 +47,7 @@ def _durably(connection: Any, _: object) -> None:
     """Configure SQLite: each commit is on the disk before it returns, and readers do not wait for writers."""
     connection.isolation_level = None  # transactions begin where the engine says so
     connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can still be printed
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
+    for pragma in (*PAGES, "journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
         connection.execute(f"PRAGMA {pragma}")
 
 

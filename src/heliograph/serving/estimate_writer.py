@@ -1,0 +1,105 @@
+"""Lines of JSON of a service: of a batch of rows at once, by a template that their numbers fill."""
+
+import re
+from collections.abc import Sequence
+from math import isfinite
+
+import numpy as np
+from pydantic_core import to_json
+
+from heliograph.filters.plausibility import in_words
+from heliograph.live.lanes import FilterColumns, Lanes, WeighedAt
+from heliograph.numerics.types import Float
+
+HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
+FIRST = 2**52  # the number of column 0 where a row holds its own columns: no name contains it
+COLUMN = re.compile(rb"(4503599627[0-9]{6})(\.0)?")
+
+
+def line(parts: object) -> bytes:
+    """Encode a value as one line of JSON, without the newline; numbers that are not finite become null."""
+    return to_json(parts, inf_nan_mode="null")
+
+
+class EstimateWriter:
+    """Writer of the estimates of a network as lines of JSON.
+
+    A row of which every filter has an estimate with a sound covariance, and used what it received, fills a template,
+    the line of a row that holds its own column numbers. Any other row is written filter by filter.
+    """
+
+    def __init__(self, lanes: Lanes):
+        self._n, n = len(lanes.network.states), len(lanes.network.states)
+        self._nodes: dict[str, list[FilterColumns]] = {}
+        for columns in lanes.places:
+            self._nodes.setdefault(columns.node, []).append(columns)
+        # Columns that decide whether the template fits.
+        claimed = [columns.covariance for columns in lanes.places if columns.claim != "none"]
+        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]
+        self._reasons = [columns.judgement.reason for columns in lanes.places if columns.judgement is not None]
+        self._finite = [i for columns in lanes.places for i in range(columns.mean, columns.mean + n)]
+        self._finite += [i for columns in lanes.places for i in range(columns.covariance, columns.covariance + n * n)]
+        self._finite += [columns.tested.distance for columns in lanes.places if columns.tested is not None]
+        # The template, the columns that fill it, and which of these are whole numbers.
+        numbered = FIRST + np.arange(float(lanes.step_rows.outputs.size))
+        numbered[self._reasons] = 0.0
+        written = line(self._estimates(numbered.tolist()))
+        filled = COLUMN.findall(written)
+        form = COLUMN.sub(lambda match: b"%b" if match[2] else b"%d", written.replace(b"%", b"%%"))
+        self._template = HEAD + form + b"}"
+        self._order = [int(digits) - FIRST for digits, _ in filled]
+        self._whole = [i for i, (_, point) in enumerate(filled) if not point]
+
+    def lines(
+        self, kind: bytes, rows: Sequence[tuple[str, float | str]], outputs: Float[np.ndarray, "row outputs"]
+    ) -> list[bytes]:
+        """Return a line with the estimates of all filters for each row, a plant and a moment, from its outputs."""
+        if not rows:
+            return []
+        fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
+        fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
+        # All numbers as texts, those of one row after those of another.
+        width, numbers = len(self._order), _texts(outputs[:, self._order].ravel().tolist())
+        columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
+        for i in self._whole:
+            columns[i] = outputs[:, self._order[i]].astype(int).tolist()
+        names = {plant: line(plant) for plant in {plant for plant, _ in rows}}
+        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _texts([moment for _, moment in rows])
+        lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
+        for i in np.flatnonzero(~fits).tolist():
+            estimates = self._estimates(outputs[i].tolist())
+            lines[i] = HEAD % tuple(column[i] for column in head) + line(estimates) + b"}"
+        return lines
+
+    def _estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
+        return {
+            node: {columns.filter: self._filter(columns, outputs) for columns in places}
+            for node, places in self._nodes.items()
+        }
+
+    def _filter(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
+        n, mean, begin, judged = self._n, columns.mean, columns.covariance, columns.judgement
+        # Estimate, without a claim where it is no number.
+        covariance = None if columns.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
+        numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
+        negative = columns.claim != "none" and min(outputs[begin : begin + n * n : n + 1]) < 0
+        claim = columns.claim if numbers and not negative else "none"
+        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
+        # Squared innovation: of a fusion that of what its nodes received, of a filter as it judged it.
+        if columns.tested is not None:
+            nis, received = (outputs[column] for column in columns.tested)
+            return results | {"nis": nis, "received": int(received) if isfinite(nis) else 0}
+        if judged is None:
+            return results
+        if columns.weighed is not None:
+            parts = zip(WeighedAt._fields, columns.weighed, strict=True)
+            results["outputs"] = {name: [outputs[i] for i in columns] for name, columns in parts}
+        if outputs[judged.reason] > 0:
+            why = in_words(outputs[judged.reason], outputs[judged.distance])
+            return results | {"nis": None, "received": 0, "implausible": why}
+        return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
+
+
+def _texts(numbers: Sequence[float | str]) -> list[bytes]:
+    """Return numbers, and texts without a comma, as JSON has them."""
+    return line(numbers)[1:-1].split(b",")
