@@ -28,7 +28,7 @@ def walk(start, number):
 def begun():
     with jax.enable_x64(True):
         program = lower(walk, np.float64(0), np.uint32(0))
-    return Accumulated(program, Summed((True, False, False), BATCHES, 1)).begin([np.float64(2.0)])
+    return Accumulated(program, Summed((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
 
 
 def expected(runs):
@@ -72,7 +72,7 @@ def test_a_sum_of_what_is_used_again():
 
     with jax.enable_x64(True):
         program = lower(twice, np.float64(0), np.uint32(0))
-    code, runs = Accumulated(program, Summed((True, False), BATCHES, 1)).begin([np.float64(2.0)]), np.arange(40)
+    code, runs = Accumulated(program, Summed((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40), np.arange(40)
     sums = code.zeros()
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.codegen.compiled import Machine, addresses, aligned, best_width, features
+from heliograph.codegen.compiled import addresses, aligned, best_width
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import written
+from heliograph.codegen.machine import Tiers, features
 from heliograph.codegen.program import Program, Summed, row_length
 
 
@@ -22,18 +23,21 @@ class Accumulated:
         self.width, self.summed, self.inputs = best_width(), summed, program.inputs
         self.code = written(program, differs, self.width, features()[2], summed=summed)
         self.common = self.code.common
-        self.blocks = Machine(self.code.blocks)
-        self.once = None if self.code.once is None else Machine(self.code.once)
+        self.blocks = Tiers(self.code.blocks)
+        self.once = None if self.code.once is None else Tiers(self.code.once)
 
-    def begin(self, arguments: Sequence[Any]) -> "Begun":
-        """Compute everything that the runs share, from the arguments other than the number of the run."""
-        return Begun(self, arguments)
+    def begin(self, arguments: Sequence[Any], runs: int) -> "Begun":
+        """Compute everything that the runs share, from the arguments other than the number of the run.
+
+        The code is made for as many runs as will follow.
+        """
+        return Begun(self, arguments, runs)
 
 
 class Begun:
     """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
-    def __init__(self, program: Accumulated, arguments: Sequence[Any]):
+    def __init__(self, program: Accumulated, arguments: Sequence[Any], runs: int):
         self.program = program
         others = (b for n, b in enumerate(program.inputs) if n != program.summed.number)
         self.arguments = [np.ascontiguousarray(x, dtype=DTYPES[b.type]) for x, b in zip(arguments, others, strict=True)]
@@ -42,12 +46,13 @@ class Begun:
         if program.once is not None:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
             pointers = self._pointers(number, results)
-            program.once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            program.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])
                 held = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
+        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
 
     def zeros(self) -> list[np.ndarray]:
         """Return sums over no runs, of each summed result: (..., batch), rows as `folded` takes them."""
@@ -72,11 +77,11 @@ class Begun:
                 results.append(np.empty(shape, DTYPES[buffer.type]))
             given.append(None if summed or common else results[-1])
         # Compute all blocks of runs.
-        if len(numbers) and not all(self.program.common):
+        if len(numbers) and self._machine is not None:
             scratch = aligned(self.program.code.scratch)
             pointers = self._pointers(numbers, results)
             blocks = -(-len(numbers) // self.program.width)
-            self.program.blocks.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
+            self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return given
 
     def _outputs(self) -> list[tuple[Any, bool]]:

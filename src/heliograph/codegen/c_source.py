@@ -197,7 +197,7 @@ class CSource:
     def _loop(self, loop: Loop, indent: str) -> list[str]:
         """Write a loop, with variables that carry numbers from turn to turn."""
         deeper, lines = f"{indent}    ", []
-        carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed]
+        carried = [p for p, node in enumerate(loop.parameters) if {node, loop.results[p]} & self.needed.keys()]
         for index in carried:
             name, start = self._new(), loop.initial[index]
             lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")

@@ -1,6 +1,5 @@
 """Functions of one run, compiled for many: LLVM IR as code of this machine, called on arrays of runs, on all cores."""
 
-import ctypes
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,50 +9,13 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
-import llvmlite.binding as llvm
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
+from heliograph.codegen.machine import ALWAYS, Function, Tiers, features
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
-
-Function = Callable[[int, int, int, int, int], None]
-SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-
-
-@cache
-def target() -> llvm.Target:
-    """Return the LLVM target of this machine."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple()
-
-
-@cache
-def features() -> tuple[str, str, bool]:
-    """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
-    flags = llvm.get_host_cpu_features()
-    arm = "aarch64" in target().triple or "arm64" in target().triple
-    return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
-
-
-class Machine:
-    """Code of one text; its function `run` may be called as long as this object exists.
-
-    LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
-    """
-
-    def __init__(self, text: str):
-        level = 0 if jax.config.values["jax_disable_most_optimizations"] else 1
-        cpu, flags, *_ = features()
-        machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
-        module = llvm.parse_assembly(text)
-        module.verify()
-        self.engine = llvm.create_mcjit_compiler(module, machine)
-        self.engine.finalize_object()
-        self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
-
 
 LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
@@ -73,8 +35,8 @@ class Compiled:
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         self.code: Code = written(program, self.differs, self.width, features()[2])
-        self.blocks = Machine(self.code.blocks)
-        self.once = None if self.code.once is None else Machine(self.code.once)
+        self.blocks = Tiers(self.code.blocks)
+        self.once = None if self.code.once is None else Tiers(self.code.once)
         self._first: list[np.ndarray] = []
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
 
@@ -84,6 +46,12 @@ class Compiled:
         new._first = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=False)]
         new._addresses = addresses(new._first)
         return new
+
+    def prepare(self) -> None:
+        """Generate the code with care now, so that no later call takes the time."""
+        for code in (self.blocks, self.once):
+            if code is not None:
+                code.machine(ALWAYS)
 
     def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
         """Return the results of all runs, with a leading axis of runs."""
@@ -96,7 +64,7 @@ class Compiled:
         ends = addresses([*outputs, shared])
         pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
         if self.once is not None:
-            self.once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            self.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
             self._copy_common(outputs, shared)
         if not all(code.common):
             self._run(pointers, runs, cores)
@@ -104,18 +72,19 @@ class Compiled:
 
     def _run(self, pointers: np.ndarray, runs: int, cores: int | None) -> None:
         blocks = -(-runs // self.width)
-        if cores == 1 or blocks * self.code.work < LITTLE:
-            self._blocks(pointers, 0, blocks, runs)
+        run = self.blocks.machine(blocks).run
+        if cores == 1 or blocks * self.code.blocks.work < LITTLE:
+            self._blocks(run, pointers, 0, blocks, runs)
             return
         cores = cores or cpu_count()
         share = -(-blocks // (cores * SHARES))
         starts = range(0, blocks, share)
-        list(threads().map(lambda start: self._blocks(pointers, start, min(start + share, blocks), runs), starts))
+        list(threads().map(lambda start: self._blocks(run, pointers, start, min(start + share, blocks), runs), starts))
 
-    def _blocks(self, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
+    def _blocks(self, run: Function, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
         """Compute blocks of runs in this thread."""
         scratch = aligned(self.code.scratch)
-        self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
+        run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         for array, common, offset, buffer in zip(
@@ -134,7 +103,7 @@ class Alone:
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
         self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
-        self.machine, self.tree, self._in_place = Machine(self.code.blocks), program.tree, in_place
+        self.machine, self.tree, self._in_place = Tiers(self.code.blocks).machine(ALWAYS), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
 

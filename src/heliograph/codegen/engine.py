@@ -12,8 +12,9 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from heliograph.codegen.compiled import Compiled, target
+from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.lowering import like
+from heliograph.codegen.machine import target
 from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown

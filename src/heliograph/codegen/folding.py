@@ -61,10 +61,11 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 
 def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
     """Return an existing or simpler node of the same value; None if there is none."""
-    if all(a.op == "constant" for a in args):
-        return _evaluated(graph, op, type, args)
-    rule = SIMPLER.get(op)
-    return None if rule is None else rule(graph, type, *args)
+    for a in args:
+        if a.op != "constant":
+            rule = SIMPLER.get(op)
+            return None if rule is None else rule(graph, type, *args)
+    return _evaluated(graph, op, type, args)
 
 
 def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:

@@ -33,14 +33,7 @@ class Graph:
 
     def unfolded(self, op: str, type: Type, args: tuple[Node, ...], value: Any = None) -> Node:
         """Make a node without simplification."""
-        key = (op, type, args, value)
-        for block in self.current.inwards():
-            if key in block.seen:
-                return block.seen[key]
-        target = self._outermost(max((a.block.depth for a in args), default=0))
-        made = target.seen[key] = self.fresh(op, type, args, target, value)
-        target.items.append(made)
-        return made
+        return self._once(op, type, args, value, max([a.block.depth for a in args], default=0))
 
     def constant(self, value: Number, type: Type) -> Node:
         """Make a constant."""
@@ -65,14 +58,8 @@ class Graph:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
         indices = tuple(i for _, i in pairs)
         value = (buffer, offset, tuple(s for s, _ in pairs))
-        key = ("load", buffer.type, indices, value)
-        for block in self.current.inwards():
-            if key in block.seen:
-                return block.seen[key]
-        target = self._outermost(max((i.block.depth for i in indices), default=0), buffer.block.depth)
-        made = target.seen[key] = self.fresh("load", buffer.type, indices, target, value)
-        target.items.append(made)
-        return made
+        depth = max([i.block.depth for i in indices], default=0)
+        return self._once("load", buffer.type, indices, value, max(depth, buffer.block.depth))
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
         """Store a number, in the open block."""
@@ -80,9 +67,23 @@ class Graph:
         buffer.stores.append(written)
         self.current.items.append(written)
 
-    def _outermost(self, *depths: int) -> Block:
-        """Return the outermost block of at least this depth, within the innermost pinned one."""
-        block, depth = self.current, max(depths)
-        while block.depth > depth and not block.pinned and block.parent is not None:
+    def _once(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int) -> Node:
+        """Return the equal node of an open block, or make one: in the outermost block of this depth that may have it.
+
+        A pinned block holds what is made within it.
+        """
+        key = (op, type, args, value)
+        target, block = None, self.current
+        while True:
+            equal = block.seen.get(key)
+            if equal is not None:
+                return equal
+            if target is None and (block.depth <= depth or block.pinned or block.parent is None):
+                target = block
+            if block.parent is None:
+                break
             block = block.parent
-        return block
+        assert target is not None
+        made = target.seen[key] = self.fresh(op, type, args, target, value)
+        target.items.append(made)
+        return made

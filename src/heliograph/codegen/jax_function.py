@@ -111,7 +111,9 @@ class _Evaluation:
 
     def _loop(self, loop: Loop) -> None:
         """Evaluate a loop: the carry is that of the graph, and the memory that the body fills."""
-        carried = [k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed]
+        carried = [
+            k for k, pair in enumerate(zip(loop.parameters, loop.results, strict=True)) if {*pair} & self.needed.keys()
+        ]
         filled, outer, memory = self._within(loop.body), self.values, self.memory
 
         # In a turn the parameters and the memory are those of the carry.

@@ -20,6 +20,7 @@ Value = Any  # a NumPy array of nodes or keys, or an array in memory
 Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
 
 RULES: dict[str, Rule] = {}  # operation of JAX -> its nodes; arguments are NumPy arrays of nodes
+NAMES: dict[Any, str] = {}  # of types of numbers, which NumPy takes long to spell
 IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in memory as they are
 
 
@@ -114,7 +115,10 @@ def scalars(value: np.ndarray) -> list[Node]:
 
 def type_of(value: Any) -> Type:
     """Return the type of a number, or of an array's numbers."""
-    name = np.dtype(value.dtype).name
+    dtype = value.dtype
+    if dtype not in NAMES:
+        NAMES[dtype] = np.dtype(dtype).name
+    name = NAMES[dtype]
     if name not in TYPES:
         raise Unsupported(f"numbers of type {name}")
     return TYPES[name]

@@ -65,14 +65,14 @@ def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
     return Program(lowering.graph, inputs, outputs, tree)
 
 
-def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda node: True) -> set[Any]:
-    """Nodes, loops, guards, buffers and stores that these numbers need; only `among` some."""
-    results: set[Any] = set()
+def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda node: True) -> dict[Any, None]:
+    """Nodes, loops, guards, buffers and stores that these numbers need, in an order without chance; `among` some."""
+    results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
     while waiting:
         node = waiting.pop()
         if node not in results and among(node):
-            results.add(node)
+            results[node] = None
             waiting += _needs(node)
     return results
 
@@ -81,8 +81,12 @@ def _needs(node: Any) -> list[Any]:
     if isinstance(node, Buffer):
         within = [] if node.inside is None else [node.inside[0]]
         return [*node.stores, *node.parts, *within]
-    around = [] if node.block.owner is None else [node.block.owner]
-    return around + _arguments(node)
+    owner = node.block.owner
+    arguments = node.args if isinstance(node, Node) and node.op not in REFERRING else _arguments(node)
+    return [*arguments] if owner is None else [owner, *arguments]
+
+
+REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
 
 
 def _arguments(node: Any) -> list[Any]:
@@ -161,6 +165,8 @@ def _order(node: Any) -> int:
 
 
 def _varies(node: Any, results: set[Any]) -> bool:
+    if isinstance(node, Node) and not results.isdisjoint(node.args):
+        return True
     if isinstance(node, Buffer):
         owner = node.owner[0]
         if owner is not node:
@@ -182,14 +188,14 @@ def _varies(node: Any, results: set[Any]) -> bool:
     if _is_apart(node.block, results):
         return True
     if node.op == "load":
-        return node.value[0].owner[0] in results or any(i in results for i in node.args)
+        return node.value[0].owner[0] in results
     if node.op in ("parameter", "result"):
         loop, index = node.value
         return loop in results or loop.initial[index] in results or loop.following[index] in results
     if node.op == "guarded":
         guard, index = node.value
         return guard in results or guard.values[index] in results
-    return any(a in results for a in node.args)
+    return False
 
 
 def _is_apart(block: Block, results: set[Any]) -> bool:

@@ -146,10 +146,11 @@ class Fleet:
         if event.time > plant.now + self._leap:
             return "future"
         rows, now = plant.rows, max(plant.now, event.arrival)
-        verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
+        key = rows.key(event)
+        verdict = rows.verdict(event, key, now - self.options.window, self.options.ahead)
         if verdict != "used":
             return verdict
-        plant.take(event, self.pool.take, self.width)
+        plant.take(event, key, self.pool.take, self.width)
         plant.now = now
         return verdict
 

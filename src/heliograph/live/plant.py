@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import TypeAlias
 
 from heliograph.live.event import Known, Verdict
-from heliograph.live.rows import HeldRow, Rows
+from heliograph.live.rows import HeldRow, Key, Rows
 
 
 @dataclass
@@ -98,12 +98,13 @@ class Plant:
     links: dict[str, Link] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
 
-    def take(self, event: Known, slot: Callable[[], int], width: int) -> None:
-        """Add an event to its row, or to a new row in a slot of its own; record the change for `undo`."""
-        index, row = self.rows.find(event)
+    def take(self, event: Known, key: Key, slot: Callable[[], int], width: int) -> None:
+        """Add an event to the row with its key, or to a new row in a slot of its own; record the change for `undo`."""
+        index, row = self.rows.find(key)
         if row is None:
-            row = HeldRow(self.rows.key(event), slot(), width)
-            self.rows.insert(index, row)
+            row = HeldRow(key, slot(), width)
+            self.rows.keys.insert(index, key)
+            self.rows.held.insert(index, row)
             self.changes.append((row, None))
         else:
             self.changes.append((row, (row.numbers.copy(), dict(row.events))))

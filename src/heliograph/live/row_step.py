@@ -133,6 +133,8 @@ class RowStep:
         self._choice = chosen(_stepped(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first(*self._numbers)
+        if self._code is not None:
+            self._code.prepare()
 
     @property
     def engine(self) -> str:

@@ -55,14 +55,14 @@ class Rows:
         """Return the index of the first row after a time."""
         return bisect_left(self.keys, (time, inf))
 
-    def verdict(self, event: Known, watermark: float, ahead: float) -> Verdict:
-        """Judge an event, for this watermark."""
+    def verdict(self, event: Known, key: Key, watermark: float, ahead: float) -> Verdict:
+        """Judge an event of the row with this key, for this watermark."""
         if event.time > event.arrival + ahead:
             return "future"
-        if self.key(event) > self.keys[-1]:  # as most are: nothing can be said against what is newest
+        if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
         base = self.finalise(watermark)[0]
-        index, row = self.find(event)
+        index, row = self.find(key)
         held = None if row is None else row.events.get(event.name)
         if index < base or (index == base and held is None):
             return "late"
@@ -73,19 +73,13 @@ class Rows:
         there = row.numbers[self.places[event.node_index]]
         return "conflict" if any(a == a and b == b for a, b in zip(there, event.values, strict=True)) else "used"
 
-    def find(self, event: Known) -> tuple[int, HeldRow | None]:
-        """Return the index of the event's row, and the row if it exists."""
-        key = self.key(event)
+    def find(self, key: Key) -> tuple[int, HeldRow | None]:
+        """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
         index = bisect_left(self.keys, key)
         there = self.keys[index] == key
         return index, self.held[index] if there else None
-
-    def insert(self, index: int, row: HeldRow) -> None:
-        """Insert a row at the index that `find` returned."""
-        self.keys.insert(index, row.key)
-        self.held.insert(index, row)
 
     def index(self, key: Key) -> int:
         """Return the index of the row with this key, or the index at which it would be inserted."""

@@ -59,18 +59,17 @@ class EstimateWriter:
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
         # All numbers as texts, those of one row after those of another.
-        width = len(self._order)
-        numbers: list[bytes | int] = [*_texts(outputs[:, self._order].ravel().tolist())]
+        width, numbers = len(self._order), _texts(outputs[:, self._order].ravel().tolist())
+        columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
         for i in self._whole:
-            numbers[i::width] = outputs[:, self._order[i]].astype(int).tolist()
+            columns[i] = outputs[:, self._order[i]].astype(int).tolist()
         names = {plant: line(plant) for plant in {plant for plant, _ in rows}}
-        heads = zip((names[plant] for plant, _ in rows), _texts([moment for _, moment in rows]), strict=True)
-        return [
-            self._template % (kind, *head, *numbers[i * width : (i + 1) * width])
-            if fits[i]
-            else HEAD % (kind, *head) + line(self._estimates(outputs[i].tolist())) + b"}"
-            for i, head in enumerate(heads)
-        ]
+        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _texts([moment for _, moment in rows])
+        lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
+        for i in np.flatnonzero(~fits).tolist():
+            estimates = self._estimates(outputs[i].tolist())
+            lines[i] = HEAD % tuple(column[i] for column in head) + line(estimates) + b"}"
+        return lines
 
     def _estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
         return {

@@ -4,6 +4,7 @@ import gc
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
+from itertools import repeat
 from time import perf_counter
 from typing import NamedTuple
 
@@ -161,15 +162,12 @@ class Service:
 
     def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
-        for message, payload, outcome in zip(messages, payloads, self._using.use(messages, self._damage), strict=True):
-            plant, verdict, why, notes = outcome
-            if plant is not None:
-                touched[plant.name] = plant
-            # Used, as most are.
-            if verdict == "used" and not notes and not isinstance(message, str):
-                used.add(message.plant)
-                continue
+        entries, malformed, known, outcomes = list[Entry](), 0, 0, self._using.use(messages, self._damage)
+        touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
+        used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
+        # All but those that were used as they are, as most were.
+        for i in [i for i, (_, verdict, _, notes) in enumerate(outcomes) if notes or verdict != "used"]:
+            message, payload, (_, verdict, why, notes) = messages[i], payloads[i], outcomes[i]
             # Of a damaged plant, or not read.
             if not isinstance(message, str) and message.plant in self._damage:
                 entries.append(_refusal(message, "damaged", self._damage[message.plant]))
@@ -180,9 +178,7 @@ class Service:
                 entries.append(_refused(None, {}, "malformed", said))
                 continue
             # Used but for some of it, known already, or refused with the reason.
-            if verdict == "used":
-                used.add(message.plant)
-            else:
+            if verdict != "used":
                 known += verdict in ("duplicate", "late")
                 entries.append(_refusal(message, verdict, why or WHY[verdict]))
             entries += [_refusal(message, "implausible", note) for note in notes]
@@ -244,8 +240,8 @@ class Service:
     def _finals(self, finalised: Iterable[Finalised]) -> list[Entry]:
         """Return final estimates, each published once: of rows that are final now and received a measurement."""
         rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
-        lines = self._lines(b"final", rows)
-        return [Entry(plant.name, "final", body) for (plant, _), body in zip(rows, lines, strict=True)]
+        names = (plant.name for plant, _ in rows)
+        return [*map(Entry._make, zip(names, repeat("final"), self._lines(b"final", rows)))]
 
     def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
         """Return the provisional estimates at the newest rows, and what the senders' silence means."""

@@ -4,7 +4,7 @@ from collections import OrderedDict
 from collections.abc import Container, Sequence
 from datetime import UTC, datetime, time
 from math import floor
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class Before(NamedTuple):
 
     known: bool
     now: float
-    links: dict[str, Link]
+    links: dict[str, tuple[Any, ...]]
 
 
 class Using:
@@ -90,7 +90,9 @@ class Using:
         plant = self.plants.get(message.plant)
         # A new plant begins with a message that is plausible and of a right clock.
         origin = self._origin(message) if plant is None else plant.origin
-        at = self._number(message.time, origin, message.plant)
+        at = message.time
+        if origin is not None or not isinstance(at, float):
+            at = self._number(at, origin, message.plant)
         now = at if plant is None else plant.now
         arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
@@ -110,10 +112,10 @@ class Using:
             plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
             self._before[plant.name] = Before(False, at, {})
         elif plant.name not in self._before:
-            links = {name: Link(**vars(link)) for name, link in plant.links.items()}
+            links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
             self._before[plant.name] = Before(True, plant.now, links)
         # Inputs and measurement are used or refused independently.
-        notes = list[str]()
+        notes: list[str] = []
         if inputs is not None and spoilt is None:
             self._take(number, plant, inputs)
         elif spoilt is not None:
@@ -130,8 +132,6 @@ class Using:
 
     def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
         """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
-        if origin is None and isinstance(moment, float):
-            return moment
         at, step = seconds(moment, origin, plant), self.fleet.options.step
         return at if origin is None or step is None else floor(at / step + 0.5)
 
@@ -146,7 +146,7 @@ class Using:
         plant, (known, now, links) = self.plants[name], self._before[name]
         if known:
             self.fleet.undo(plant, now)
-            plant.links = links
+            plant.links = {name: Link(*counts) for name, counts in links.items()}
         else:
             self.fleet.end(self.plants.pop(name))
 

@@ -189,7 +189,7 @@ def test_sums_depend_on_no_chunk(monkeypatch):
 def code(network: hg.Network, seed: int = 0):
     world = World(network.plant, medium_of(network), AllFilters(network))
     with jax.enable_x64(True):
-        return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories())
+        return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories(), 8)
 
 
 @pytest.mark.slow
@@ -250,4 +250,4 @@ def test_keys_of_another_hash_are_simulated_by_xla():
     assert np.isfinite(record.truth).all()
     world = World(network.plant, medium_of(network), AllFilters(network))
     with pytest.raises(Unsupported, match="rbg"):
-        native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories())
+        native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)

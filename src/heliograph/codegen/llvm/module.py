@@ -1,6 +1,7 @@
 """Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
@@ -22,17 +23,24 @@ LONGEST = 200_000  # operations: at 120,000 LLVM takes half as long as XLA, 0.1 
 LINE = 64  # bytes: where vectors of any width may start
 
 
+class Source(NamedTuple):
+    """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop."""
+
+    text: str
+    operations: int
+    work: int
+
+
 class Code(NamedTuple):
     """Text of the two functions, and their arguments.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
     `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
-    program, `divisions` those of them that divide or take roots; a block executes `work` of them, with each turn of its
-    loops.
+    program, `divisions` those of them that divide or take roots.
     """
 
-    blocks: str
-    once: str | None
+    blocks: Source
+    once: Source | None
     tables: list[np.ndarray]
     outputs: list[Buffer]
     common: list[bool]
@@ -41,7 +49,6 @@ class Code(NamedTuple):
     scratch: int
     operations: int
     divisions: int
-    work: int
 
 
 def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
@@ -103,20 +110,20 @@ def written(
     # Numbers that differ between runs; all others are computed once.
     spread = varying(outputs, lanes)
     if alone:
-        spread = items | set(program.inputs)
+        spread = {*items, *program.inputs}
     products = products_of(sorted_items(items)) if fuse else set()
     tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
     common = [b not in spread for b in outputs]
     spread -= set(tables)
     # Layout: per thread in scratch memory, shared by all runs in shared memory.
-    owners = {x.owner[0] for x in items if isinstance(x, Buffer)}
+    owners = dict.fromkeys(x.owner[0] for x in items if isinstance(x, Buffer))
     added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
     _check_sums(items, added)
     scratch, in_scratch = _places(
         [
             b
-            for b in owners - added
-            if b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
+            for b in owners
+            if b not in added and b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
         ],
         width,
         0,
@@ -136,12 +143,11 @@ def written(
     once = None
     if roots:
         writer = Writer(1, needed(roots), products, set(), slots)
-        once = _with_functions(_once(writer, program, pointers, in_shared), writer)
+        once = _source(_with_functions(_once(writer, program, pointers, in_shared), writer), writer.mine)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    return Code(
-        text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, divisions, _work(mine)
-    )
+    source = _source(text, mine)
+    return Code(source, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, divisions)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -156,9 +162,11 @@ def sorted_items(items: Iterable[Any]) -> list[Any]:
     return sorted(items, key=lambda x: x.serial if isinstance(x, Node) else -1)
 
 
-def _work(items: Iterable[Any]) -> int:
-    """Count the executed operations of a block of runs; a loop of unknown length counts as one turn."""
-    return sum(math.prod(loop.length or 1 for loop in loops_of(x)) for x in items if isinstance(x, Node))
+def _source(text: str, items: Iterable[Any]) -> Source:
+    """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
+    counts = Counter(x.block for x in items if isinstance(x, Node))
+    turns = {block: math.prod(loop.length or 1 for loop in loops_of(block)) for block in counts}
+    return Source(text, counts.total(), sum(count * turns[block] for block, count in counts.items()))
 
 
 def _places(buffers: Iterable[Buffer], width: int, start: int) -> tuple[int, dict[Buffer, int]]:

@@ -6,6 +6,7 @@ of a result depend neither on the width nor on the level of optimisation.
 
 import struct
 from collections.abc import Callable
+from functools import cache
 
 from heliograph.codegen.nodes import Node, Type, Unsupported
 from heliograph.codegen.vectors.elementary import FUNCTIONS, SCALAR
@@ -21,6 +22,7 @@ CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` befo
 Emit = Callable[[str], str]  # the text of an operation -> the name of its result
 
 
+@cache
 def vector(type: Type, width: int) -> str:
     """Return the type <W x T>."""
     return f"<{width} x {LLVM[type]}>"
@@ -43,8 +45,10 @@ def splat(value: float | int | bool, type: Type) -> str:
 def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
     """Emit the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
-    operand_type, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
+    operand_type = vector(source, width)
     op, result_type = node.op, vector(node.type, width)
+    if source == "f64" and op in FLOAT:
+        return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
     if op == "select":
         return emit(f"select {operand_type} {names[0]}, {result_type} {names[1]}, {result_type} {names[2]}")
     # Comparisons and conversions depend on the type of the arguments.
@@ -60,6 +64,7 @@ def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{op}({typed})")
+    kind = f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
     if source == "f64":
         return _of_doubles(op, names, operand_type, kind, width, emit)
     return _of_integers(node, names, operand_type, kind, emit)
@@ -75,8 +80,6 @@ def _comparison(op: str, type: Type) -> str:
 
 def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emit: Emit) -> str:
     first = f"{text} {names[0]}"
-    if op in FLOAT:
-        return emit(f"{FLOAT[op]} {first}, {names[1]}")
     if op == "neg":
         return emit(f"fneg {first}")
     if op in UNARY:

@@ -3,7 +3,7 @@
 What the second computes is in memory between them, in `Slots`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from heliograph.codegen.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
@@ -29,7 +29,7 @@ class Slots:
         if node not in self.places:
             self.places[node] = self.size
             turns = 1
-            for loop in loops_of(node):
+            for loop in loops_of(node.block):
                 turns *= loop.length or 1
             self.size += 8 * turns
         return self.places[node]
@@ -54,7 +54,7 @@ class Slots:
 
     def _address(self, writer: "Writer", node: Node) -> str:
         offset, stride, index = self.offset_of(node), 8, ""
-        for loop in loops_of(node):
+        for loop in loops_of(node.block):
             assert loop.counter is not None
             step = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
             index = writer.add(f"add i64 {index}, {step}") if index else step
@@ -63,9 +63,9 @@ class Slots:
         return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
 
-def loops_of(node: Node) -> list[Loop]:
-    """Return the loops around a node, innermost first."""
-    return [b.owner for b in node.block.inwards() if isinstance(b.owner, Loop)]
+def loops_of(block: Block) -> list[Loop]:
+    """Return the loops around a block's nodes, innermost first."""
+    return [b.owner for b in block.inwards() if isinstance(b.owner, Loop)]
 
 
 class Writer:
@@ -75,7 +75,7 @@ class Writer:
     all runs share and that the other function computes.
     """
 
-    def __init__(self, width: int, mine: set[Any], products: set[Node], spread: set[Any], slots: Slots):
+    def __init__(self, width: int, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
         self.width, self.mine, self.products, self.spread, self.slots = width, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]

@@ -257,7 +257,7 @@ class Store:
             versions = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
             if any(versions.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
-            outputs = [entry.numbered(newest - len(entries) + i) for i, entry in enumerate(entries, 1)]
+            outputs = Entry.numbered(entries, newest - len(entries) + 1)
             # Plants with their next version, the batch in the journal, and the counts.
             if plants:
                 after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())

@@ -35,9 +35,11 @@ class Entry(NamedTuple):
     kind: Kind
     body: bytes
 
-    def numbered(self, number: int) -> Output:
-        """Return the output with its number."""
-        return Output(number, self.plant, self.kind, b'{"id":%d,' % number + self.body[1:])
+    @staticmethod
+    def numbered(entries: Iterable["Entry"], begin: int) -> list[Output]:
+        """Return the outputs with their numbers, counted from `begin`."""
+        counted = enumerate(entries, begin)
+        return [Output._make((i, plant, kind, b'{"id":%d,' % i + body[1:], "")) for i, (plant, kind, body) in counted]
 
 
 class ConflictError(Exception):
@@ -107,7 +109,7 @@ class InMemoryStore:
         """Number the outputs, counting from 1."""
         begin = self._number + 1
         self._number += len(entries)
-        return [entry.numbered(number) for number, entry in enumerate(entries, begin)]
+        return Entry.numbered(entries, begin)
 
     def unpublished(self) -> list[Output]:
         """Return no outputs: none are stored."""

@@ -46,11 +46,17 @@ class Native(NamedTuple):
 
 
 def native(
-    world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], later: Smoother | None = None
+    world: World,
+    inputs: np.ndarray,
+    key: jax.Array,
+    reducer: AbstractReducer[Any],
+    runs: int,
+    later: Smoother | None = None,
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
-    With `later`, the results are a pair: of filtered and of smoothed estimates; and sums of the NIS.
+    `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
+    of the NIS.
 
     Raises:
         Unsupported: a program that native code does not support.
@@ -73,7 +79,7 @@ def native(
         raise Unsupported(made.operation, made.where)
     program, form = made
     words = np.asarray(jax.random.key_data(key))
-    return Native(program.begin([words, *(a for a in arrays if _is_given(a))]), form)
+    return Native(program.begin([words, *(a for a in arrays if _is_given(a))], runs), form)
 
 
 class _Known:
@@ -229,7 +235,7 @@ def natively(
     # Smoothing, few nodes, or nodes that share something: one program.
     whole = smoothing is not None or len(network.names) <= NODES or not _is_apart(network)
     if whole or type(reducer).joined is AbstractReducer.joined:
-        code = attempted(lambda: _code(network, inputs, key, reducer, smoothing))
+        code = attempted(lambda: _code(network, inputs, key, reducer, runs, smoothing))
         return (
             None
             if code is None
@@ -238,7 +244,7 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
-        code = attempted(lambda: _code(some, inputs, key, reducer))  # noqa: B023
+        code = attempted(lambda: _code(some, inputs, key, reducer, runs))  # noqa: B023
         if code is None:
             return None
 
@@ -264,11 +270,16 @@ def _parts(network: Network) -> Iterator[Network]:
 
 
 def _code(
-    network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], smoothing: Part | None = None
+    network: Network,
+    inputs: np.ndarray,
+    key: jax.Array,
+    reducer: AbstractReducer[Any],
+    runs: int,
+    smoothing: Part | None = None,
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), filters)
-    return native(world, inputs, key, reducer, smoothing and smoothing.smoother(filters))
+    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters))
 
 
 def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:

@@ -1,0 +1,70 @@
+"""Code in haste, and with care once its executions have cost as much: the same bits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph.codegen.compiled import compile
+from heliograph.codegen.machine import OFTEN
+
+STEPS = 500
+STARTS = np.random.default_rng(7).normal(size=(16, 2))
+
+
+def rotated(x):
+    """A loop with products, a division, a root and functions."""
+
+    def step(x, k):
+        a, b = x[0] * 0.9 + x[1] * x[0] / (1.0 + x[1] ** 2), jnp.sqrt(1.0 + jnp.sin(x[0]) ** 2) - jnp.exp(-(x[1] ** 2))
+        return jnp.stack([a, b]), a * b
+
+    return jax.lax.scan(step, x, jnp.arange(STEPS))
+
+
+@pytest.fixture
+def optimized():
+    """Optimisations, which other tests do without."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture
+def code(optimized):
+    return compile(rotated, STARTS[0])
+
+
+def level(code):
+    """The level at which the blocks' code is generated, without another execution."""
+    return code.blocks.machine(0).level
+
+
+def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code):
+    """Two blocks of 500 steps a call; the numbers are the same bits before and after."""
+    source = code.code.blocks
+    often = -(-OFTEN // (2 * source.work / source.operations))
+    calls = [code(STARTS) for _ in range(int(often) - 1)]
+    assert level(code) == 0
+    calls.append(code(STARTS))
+    assert level(code) == 1
+    for a, b in zip(*map(jax.tree.leaves, (calls[0], calls[-1])), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_call_that_executes_its_code_often_waits_for_care(code):
+    code(np.tile(STARTS, (3 * OFTEN // (2 * STEPS), 1)))
+    assert level(code) == 1
+
+
+def test_prepared_code_is_not_generated_again(code):
+    code.prepare()
+    prepared = code.blocks.machine(0)
+    code(STARTS)
+    assert code.blocks.machine(OFTEN) is prepared and prepared.level == 1
+
+
+def test_no_code_is_generated_with_care_without_optimizations(code):
+    jax.config.update("jax_disable_most_optimizations", True)
+    assert code.blocks.machine(2 * OFTEN).level == 0
