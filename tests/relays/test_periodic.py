@@ -106,6 +106,21 @@ def test_a_plant_without_noise_comes_to_rest():
     assert all(np.all(covariance == 0) for covariance in design.covariance.values())
 
 
+@pytest.mark.slow
+def test_relays_that_receive_only_each_other_learn_nothing():
+    """Their innovations are zero, computed from large numbers: what rounding leaves of them is no information."""
+    plant = LinearPlant([[0.5, 0.4], [-0.3, 0.6]], [[0.3, 0.1], [0.1, 0.2]], np.zeros(2), np.eye(2))
+    sensor, free = LinearSensor([[1.0, 0.3], [-0.2, 1.0]], 0.1 * np.eye(2)), np.zeros((2, 2))
+    both = {"a": {"b": hop(Rayleigh(0.9), free)}, "b": {"a": hop(0.7, free)}}
+    slots = (both | {"receiver": {"sensor": hop(1.0, 0.1 * np.eye(2))}}, {"a": {"a": hop(0.6, free)}})
+    design = periodic_local_error_design(RelayNetwork(plant, sensor, ("a", "b"), slots))
+    deaf = RelayNetwork(plant, sensor, (), ({"receiver": {"sensor": hop(0.0, np.eye(2))}},))
+    still = periodic_local_error_design(deaf)
+    assert all(np.all(design.gains[name] == 0) for name in ("a", "b"))
+    for name in ("a", "b"):
+        np.testing.assert_allclose(design.covariance[name][-1], still.covariance["receiver"][-1], rtol=1e-11)
+
+
 def test_a_periodic_design_is_no_schedule_from_the_start(local):
     """Its covariances are those after long, not those of the first period."""
     net = example()

@@ -91,6 +91,24 @@ def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
     return np.asarray(np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner)
 
 
+ROUNDING = 64 * float(np.finfo(float).eps)  # of what is sent: an innovation of less says nothing
+
+
+def beyond_rounding(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "R"]:
+    """Return 1 for innovations with more variance than what is sent leaves by rounding, 0 for others.
+
+    Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
+    """
+    n, relays, d = p.transition.shape[-1], len(p.received) - 1, z.shape[0] - sum(p.received)
+    reach = jnp.sqrt(jnp.maximum(jnp.diagonal(z)[:d], 0.0)).reshape(-1, n)  # of x, e_1 .. e_F
+    state = reach[0] + jnp.abs(p.state_mean)
+    sizes = jnp.concatenate([state[None], state + reach[1 : 1 + relays]]) @ jnp.abs(p.sensing).T
+    sent = jnp.append(sizes.ravel(), 1.0)
+    known = ROUNDING * jnp.abs(p.gain) @ sent[:-1]
+    spread = ROUNDING * jnp.einsum("iiab,a,b->i", jnp.abs(p.spread), sent, sent)
+    return jnp.where(jnp.diagonal(z)[d:] > known**2 + spread, 1.0, 0.0)
+
+
 def local_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
     """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
@@ -99,10 +117,12 @@ def local_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]
     n, received = p.transition.shape[-1], sum(p.received)
     d = z.shape[0] - received
     gain, start = jnp.zeros((d - n, received)), 0
+    used = p.live * beyond_rounding(z, p)
     for f, length in enumerate(p.received):
         rows = slice(start, start + length)
-        inner = z[d:, d:][rows, rows] + jnp.diag(1.0 - p.live[rows])  # a filter that receives nothing: solve with 1
-        cross = z[(1 + f) * n : (2 + f) * n, d:][:, rows] * p.live[rows]
+        says = used[rows]
+        inner = z[d:, d:][rows, rows] * says[:, None] * says + jnp.diag(1.0 - says)  # what says nothing: solve with 1
+        cross = z[(1 + f) * n : (2 + f) * n, d:][:, rows] * says
         gain = gain.at[f * n : (f + 1) * n, rows].set(psd_solve(inner, cross.T).T)
         start += length
     return gain
