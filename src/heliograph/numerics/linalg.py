@@ -228,7 +228,7 @@ def written_solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
         x: list[jax.Array] = []
         for i, scale in reversed(list(enumerate(scales))):
             x.insert(0, left[i] * scale)
-            left = left[:i] - _beside(rows[i, :i], left) * x[0]
+            left = left[:i] - _with_axes(rows[i, :i], left) * x[0]
         return jnp.stack(x)
 
     return solved
@@ -341,11 +341,11 @@ def _forward(columns: list[jax.Array], scales: list[jax.Array], b: jax.Array) ->
     left = b.reshape(b.shape + (1,) * (columns[0].ndim - b.ndim))
     for column, scale in zip(columns, scales, strict=True):
         rests.append(left[0])
-        left = left[1:] - _beside(column[1:], left) * (left[0] * scale)
+        left = left[1:] - _with_axes(column[1:], left) * (left[0] * scale)
     return rests
 
 
-def _beside(entries: jax.Array, matrix: jax.Array) -> jax.Array:
+def _with_axes(entries: jax.Array, matrix: jax.Array) -> jax.Array:
     """A column's entries (n, ...) with axes for the columns of a matrix (n, k, ...)."""
     return jnp.expand_dims(entries, tuple(range(1, 1 + matrix.ndim - entries.ndim)))
 
