@@ -7,11 +7,11 @@ Differences are in units of the claimed deviation, and beyond 1e-12 of it only b
 state a million deviations from zero has six digits fewer than its error. What is NaN must be NaN under both. Of those
 that differ by more, five were looked at, and neither engine is nearer to the truth in those where it is known:
 
-- 155: a noiseless sensor of one state, whose error has the variance 0. Native code says 2.1e-17, XLA 8.7e-18: three
-  and one roundings of the variance of the process noise, 0.014, in units of the claim itself.
+- 155: one state behind no noise at all, of which filters claim the variance 0 in exact arithmetic. Native code says
+  2.1e-17, XLA 8.7e-18: seven and three roundings of the variance before the measurement, 0.014, in units of the claim.
 - 161: a singular initial covariance, whose last pivot is -4e-16 of the diagonal entry in exact arithmetic and comes out
-  as 1e-14, the rounding of the pivots before it. Both factors make the covariance to .4 roundings; their last
-  entries, 5.35e-8, differ by 6e-11 alone, and by all of it where one engine takes the pivot for zero.
+  as 1e-14, the rounding of the pivots before it, or is taken for zero. Its root, 5e-8, is what the states differ by; a
+  factor that has it makes the covariance to .4 roundings, one without it to 54.
 - 49, 244: covariances with eigenvalues of 6e-9 of the diagonal, of which an intersection needs inverses: it is off the
   same formula in fractions by 3.8e-8 and 1.9e-8 natively, 2.8e-8 and 1.5e-8 by XLA.
 - 94: both are within 1.4e-12 of the formula, of reports that differ by their rounding: inverses magnify it to 1.9e-8.
