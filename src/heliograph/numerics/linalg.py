@@ -245,10 +245,8 @@ def long_factor(a: jax.Array) -> jax.Array:
         # a: the Schur complement of the pivot.
         return a - jnp.outer(column, column), done.at[:, j].set(column), jnp.maximum(growth, whole[j] * scale * scale)
 
-    lower: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a), jnp.zeros_like(a[0, 0])))[
-        1
-    ]
-    return lower
+    start = jnp.asarray(a), jnp.zeros_like(a), jnp.zeros_like(a[0, 0])
+    return jnp.asarray(jax.lax.fori_loop(0, n, eliminate, start)[1])
 
 
 @partial(runs_last, written=lambda a: lower_factor(factor(a)[0]), shapes=jnp.shape)
@@ -385,9 +383,7 @@ def cholesky(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
     return (_long_root if len(a) > UNROLL_LIMIT else _short_cholesky)(jnp.asarray(a))
 
 
-@runs_last_of(jnp.shape)
-def _short_cholesky(a: jax.Array) -> jax.Array:
-    return lower_factor(factor(a)[0])
+_short_cholesky = runs_last_of(jnp.shape)(lambda a: lower_factor(factor(a)[0]))
 
 
 def psd_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:

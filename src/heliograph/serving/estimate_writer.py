@@ -12,7 +12,7 @@ from heliograph.live.lanes import FilterColumns, Lanes, WeighedAt
 from heliograph.numerics.types import Float
 
 HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
-FIRST = 2**52  # the number of column 0 where a row holds its own columns: no name contains it
+FIRST = 2**52  # the number of column 0 where a row holds column numbers: no name contains it
 COLUMN = re.compile(rb"(4503599627[0-9]{6})(\.0)?")
 
 
@@ -25,7 +25,7 @@ class EstimateWriter:
     """Writer of the estimates of a network as lines of JSON.
 
     A row of which every filter has an estimate with a sound covariance, and used what it received, fills a template,
-    the line of a row that holds its own column numbers. Any other row is written filter by filter.
+    the line of a row that holds column numbers. Any other row is written filter by filter.
     """
 
     def __init__(self, lanes: Lanes):

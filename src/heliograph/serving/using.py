@@ -45,7 +45,7 @@ class Using:
         """
         self._refused = self._implausible_inputs(messages)
         outcomes = [NOTHING] * len(messages)
-        # One plant after another, whose memory is near then; the messages of a plant in their order.
+        # One plant after another, so that its memory is near; the messages of a plant in their order.
         by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
             name = "" if isinstance(message, str) else message.plant

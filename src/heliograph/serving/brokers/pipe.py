@@ -14,7 +14,10 @@ from heliograph.serving.message import LONGEST, Payload
 from heliograph.serving.output import Output
 
 READ = 1 << 20  # bytes of a batch
-FULL, MORE = 1 << 15, 2  # bytes of a pipe whose sender is ahead, so that we wait for more; for so many milliseconds
+FULL, MORE = (
+    1 << 15,
+    2,
+)  # bytes of a pipe with a sender that is ahead, so that we wait for more; for so many milliseconds
 AT_ONCE = 4096  # bytes that a pipe takes without waiting, once it takes any
 
 
