@@ -136,6 +136,17 @@ def speed(nodes: int, steps: int, rule: str, settle: int = 45) -> dict[str, floa
     }
 
 
+def read() -> dict[str, Any]:
+    """Measurements of earlier runs; graphs that were drawn are not drawn again."""
+    path = Path(__file__).with_suffix(".json")
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def add(key: str, measured: dict[str, Any]) -> None:
+    """Write one measurement beside the others."""
+    Path(__file__).with_suffix(".json").write_text(json.dumps(read() | {key: measured}, indent=1) + "\n")
+
+
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser()
@@ -145,21 +156,18 @@ def main() -> None:
     parser.add_argument("--speed", nargs="*", default=["trace", "diagonal"])
     parser.add_argument("--sizes", type=int, nargs="*", default=[1000], help="nodes of --speed")
     options = parser.parse_args()
-    path = Path(__file__).with_suffix(".json")
-    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    for nodes in options.nodes:
-        for loss in options.losses:
-            drawn: list[dict[str, float]] = []
-            for seed in range(options.graphs):
-                drawn.append(errors(nodes, loss, seed))
-                means = {k: [round(float(f([d[k] for d in drawn])), 3) for f in (np.mean, np.std)] for k in drawn[0]}
-                results[f"{nodes} nodes, {loss:g} lost"] = {"graphs": len(drawn), "mean and deviation": means}
-                path.write_text(json.dumps(results, indent=1) + "\n")
-            print(nodes, loss, means, flush=True)
+    for nodes, loss in product(options.nodes, options.losses):
+        key = f"{nodes} nodes, {loss:g} lost"
+        drawn: list[dict[str, float]] = read().get(key, {}).get("each", [])
+        for seed in range(len(drawn), options.graphs):
+            drawn.append({k: round(v, 4) for k, v in errors(nodes, loss, seed).items()})
+            means = {k: [round(float(f([d[k] for d in drawn])), 3) for f in (np.mean, np.std)] for k in drawn[0]}
+            add(key, {"graphs": len(drawn), "mean and deviation": means, "each": drawn})
+            print(key, seed, means, flush=True)
     for nodes, rule in product(options.sizes, options.speed):
-        results[f"{nodes} nodes, 1000 steps, {rule}"] = made = speed(nodes, 1000, rule)
+        made = speed(nodes, 1000, rule)
+        add(f"{nodes} nodes, 1000 steps, {rule}", made)
         print(nodes, rule, made, flush=True)
-        path.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":
