@@ -274,6 +274,21 @@ def test_numbers_read_as_others_of_fewer_bits_are_computed_by_xla():
     np.testing.assert_array_equal(hg.simulation.over_runs(words, x), x.view(np.uint32).reshape(3, 2, 2))
 
 
+def test_numbers_are_found_in_a_table_as_jax_finds_them():
+    """Which of some choices with given probabilities a uniform number means; NaN and zeros with a sign by their bits."""
+    table = np.array([-np.inf, -2.0, -0.0, 0.0, 5e-300, 1.0, 1.0, np.inf, np.nan])
+
+    def found(x):
+        return jnp.searchsorted(table, x), jnp.searchsorted(table, x, side="right")
+
+    x = np.array([*table, -np.nan, -3.0, 0.5, 1e300])
+    assert engine_of(found, x).startswith("native")
+    with jax.enable_x64(True):
+        by_jax = jax.vmap(found)(x)
+    for values, expected in zip(hg.simulation.over_runs(found, x), by_jax, strict=True):
+        np.testing.assert_array_equal(values, expected)
+
+
 def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypatch):
     def unknown():
         raise RuntimeError("no target for this processor")

@@ -12,7 +12,7 @@ from heliograph.numerics.linalg import UNROLL_LIMIT, cholesky, psd_solve
 RANDOM = np.random.default_rng(6)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 9, pytest.param(20, marks=pytest.mark.slow)])
 def test_eigenvalues_are_those_of_the_library(n):
     """To rounding of the largest; also where scales differ by ten decades, of equal eigenvalues and of zero."""
     a = RANDOM.normal(size=(20, n, n))

@@ -1,7 +1,7 @@
 """Rules of elementwise operations."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -139,6 +139,22 @@ def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list
     return inputs
 
 
+def _total_order(op: str) -> Callable[..., Node]:
+    """Compare in the order of IEEE 754 that has all numbers: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
+
+    def rank(graph: Graph, x: Node) -> Node:
+        # Bits as an integer without sign: all of a negative number's are turned round, of others the sign's.
+        if x.type != "f64":
+            return x
+        bits = graph.node("bitcast", "u64", x)
+        negative = graph.node("shift_right", "u64", bits, graph.constant(63, "u64"))
+        all_bits = graph.node("sub", "u64", graph.constant(0, "u64"), negative)
+        sign = graph.constant(1 << 63, "u64")
+        return graph.node("xor", "u64", bits, graph.node("or", "u64", all_bits, sign))
+
+    return lambda graph, type, params, x, y: graph.node(op, type, rank(graph, x), rank(graph, y))
+
+
 def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
     return graph.node("shift_right" if type[0] == "u" else "shift_right_signed", type, x, by)
 
@@ -149,7 +165,9 @@ RULES |= {
     "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
     "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
     "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),
-    "round": _composed(_round), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
+    "eq_to": _composed(_total_order("eq")), "le_to": _composed(_total_order("le")),
+    "lt_to": _composed(_total_order("lt")), "round": _composed(_round),
+    "shift_right_arithmetic": _composed(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 RULES |= dict.fromkeys(PASSED_ON, _as_it_is)
