@@ -41,7 +41,7 @@ def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, insi
     low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
     angle = low + (high - low) * NODES
     e = radius * jnp.sin(angle)
-    others = jax.vmap(lambda r: ball_moments(centre[1:], variance[1:], r, inside))(radius * jnp.cos(angle))
+    others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(angle))
     weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
     weight = weight - ((e - first) / deviation) ** 2 / 2
     mean = jnp.concatenate([e[:, None], others.mean], axis=1)
@@ -80,7 +80,7 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         less = jnp.where(possible, jnp.diag(size) - moments.covariance, 0.0)
         return moments.log_mass, mean + gain @ shift, covariance - gain @ less @ gain.T
 
-    log_mass, mean, covariance = jax.vmap(single)(parts.mean, parts.covariance)
+    log_mass, mean, covariance = jax.lax.map(lambda part: single(*part), (parts.mean, parts.covariance))
     return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
 
 
