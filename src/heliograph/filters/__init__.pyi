@@ -96,7 +96,7 @@ from .linear.truth import (
     TrueError as TrueError,
     true_error as true_error,
 )
-from .weights import (
+from .gaussian.robust import (
     Gate as Gate,
     Huber as Huber,
     InverseMultiquadric as InverseMultiquadric,

@@ -8,16 +8,19 @@ import jax.numpy as jnp
 
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
 from heliograph.fusion.mesh.gains import Believed, Weights
-from heliograph.fusion.mesh.weights import (
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.fusion.weights import (
     SHORT,
     arrived_scalar_weights,
     arrived_weights,
     arrived_weights_by_component,
     component_weights,
+    diagonal_weights,
+    matrix_weights,
+    scalar_weights,
+    weighted,
     weighted_by_component,
 )
-from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
-from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, Bool, Float, PyTree
