@@ -37,6 +37,7 @@ def inspect(
 
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
+    # What there is, and what to paste.
     topics, broken = _topics(recording, seconds)
     _print_table(topics)
     if topics:

@@ -93,6 +93,7 @@ def run(
         if out is not None:
             advance(f"writing {out}")
             write(record, out)
+    # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, record, recording, report)
     if messages is not None:

@@ -19,7 +19,6 @@ from .wrappers.delay import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (
-    FedBackFilter as FedBackFilter,
     fed_back_filter as fed_back_filter,
 )
 from .gaussian.gaussian import (
