@@ -128,12 +128,12 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
 
 def predicted(belief: LinearBelief, move: Move) -> LinearBelief:
     """Both pairs of moments after x+ = A x + b + w, with the move (A, b, Cov w)."""
-    error, state = _moved(*belief[:2], *move), _moved(*belief[2:], *move)
+    error, state = moved(*belief[:2], *move), moved(*belief[2:], *move)
     return LinearBelief(*error, *_within_range(*state))
 
 
 @runs_last
-def _moved(
+def moved(
     mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """A m + b and A P A' + Q."""
