@@ -47,6 +47,6 @@ def guarded(tables, x, at):
 def test_what_runs_share_in_a_loop_is_that_of_each_turn(function):
     """Of each row of the tables, not of the last; sums of nine products differ by their order: 30 steps, 1e-12."""
     with jax.enable_x64(True):
-        found = chosen(function, [TABLES, STATES, PLACES], [False, True, True]).results()
+        computed = chosen(function, [TABLES, STATES, PLACES], [False, True, True]).results()
         expected = np.stack([jax.jit(function)(TABLES, x, at) for x, at in zip(STATES, PLACES, strict=True)])
-    assert np.max(np.abs(found - expected)) < 1e-12
+    assert np.max(np.abs(computed - expected)) < 1e-12
