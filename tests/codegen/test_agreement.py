@@ -275,7 +275,7 @@ def test_numbers_read_as_others_of_fewer_bits_are_computed_by_xla():
 
 
 def test_numbers_are_found_in_a_table_as_jax_finds_them():
-    """Which of some choices with given probabilities a uniform number means; NaN and zeros with a sign by their bits."""
+    """Which of several choices a uniform number means; NaN and zeros with a sign by their bits."""
     table = np.array([-np.inf, -2.0, -0.0, 0.0, 5e-300, 1.0, 1.0, np.inf, np.nan])
 
     def found(x):
