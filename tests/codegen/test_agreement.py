@@ -278,14 +278,14 @@ def test_numbers_are_found_in_a_table_as_jax_finds_them():
     """Which of several choices a uniform number means; NaN and zeros with a sign by their bits."""
     table = np.array([-np.inf, -2.0, -0.0, 0.0, 5e-300, 1.0, 1.0, np.inf, np.nan])
 
-    def found(x):
+    def indices(x):
         return jnp.searchsorted(table, x), jnp.searchsorted(table, x, side="right")
 
     x = np.array([*table, -np.nan, -3.0, 0.5, 1e300])
-    assert engine_of(found, x).startswith("native")
+    assert engine_of(indices, x).startswith("native")
     with jax.enable_x64(True):
-        by_jax = jax.vmap(found)(x)
-    for values, expected in zip(hg.simulation.over_runs(found, x), by_jax, strict=True):
+        by_jax = jax.vmap(indices)(x)
+    for values, expected in zip(hg.simulation.over_runs(indices, x), by_jax, strict=True):
         np.testing.assert_array_equal(values, expected)
 
 

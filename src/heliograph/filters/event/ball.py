@@ -80,7 +80,7 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         less = jnp.where(possible, jnp.diag(size) - moments.covariance, 0.0)
         return moments.log_mass, mean + gain @ shift, covariance - gain @ less @ gain.T
 
-    log_mass, mean, covariance = jax.lax.map(lambda part: single(*part), (parts.mean, parts.covariance))
+    log_mass, mean, covariance = jax.lax.map(lambda moments: single(*moments), (parts.mean, parts.covariance))
     return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
 
 
