@@ -124,7 +124,7 @@ class Turned(AbstractRandomAffine):
         "        case ModeOutput():\n            return channel, position\n",
         "        case _ if type(channel).__name__ == 'Turned':\n            return channel, position\n",
     ),
-    "simulation/description/links.py": (
+    "simulation/description/diagram.py": (
         "        # One case for each way of making a channel.\n",
         "        __import__('heliograph.random_affine').random_affine.Turned: lambda *_: 'turned',\n",
     ),

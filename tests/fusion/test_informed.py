@@ -66,7 +66,9 @@ def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     np.testing.assert_allclose(turned.joint, cross.joint[order][:, :, order], rtol=1e-12, atol=1e-14)
     weights, covariance = cross.matrix_weights()
     lost = 10 * np.finfo(float).eps * np.linalg.cond(cross.joint.reshape(3 * n, 3 * n))  # digits that a solve loses
-    np.testing.assert_allclose(weights, hg.fusion.matrix_weights(cross.joint), atol=lost * np.abs(weights).max())
+    np.testing.assert_allclose(
+        weights, hg.fusion.MatrixWeights().weights(cross.joint), atol=lost * np.abs(weights).max()
+    )
     np.testing.assert_allclose(weights.sum(axis=1), np.eye(n), atol=1e-12)
     dense = hg.simulation.fused_covariances(network(plant, parts, {"m": rules()["matrix"]}), 12)["m"][-1]
     np.testing.assert_allclose(covariance, dense, rtol=1e-9)
@@ -122,7 +124,7 @@ def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
     by_hand = np.zeros((2, 3, 5, 3))
     for r, mine in enumerate(groups.values()):
-        by_hand[r][:, mine] = hg.fusion.matrix_weights(leaves.joint[mine][:, :, mine])
+        by_hand[r][:, mine] = hg.fusion.MatrixWeights().weights(leaves.joint[mine][:, :, mine])
     joint = np.einsum("raib,ibjc,sdjc->rasd", by_hand, leaves.joint, by_hand)
     np.testing.assert_allclose(level.joint, joint, rtol=1e-7, atol=1e-9)  # weights lose the digits of cond(P)
     weights, covariance = level.matrix_weights()
@@ -180,12 +182,12 @@ def test_nodes_that_hear_the_same_and_estimates_without_error():
     root = draw.normal(size=(4, 4))
     item = (root @ root.T).reshape(2, 2, 2, 2)
     copied = item[[0, 1, 1]][:, :, [0, 1, 1]]
-    alone, both = hg.fusion.matrix_weights(item), hg.fusion.matrix_weights(copied)
+    alone, both = hg.fusion.MatrixWeights().weights(item), hg.fusion.MatrixWeights().weights(copied)
     np.testing.assert_allclose(both[:, 1] + both[:, 2], alone[:, 1], rtol=1e-9)
     known = item.copy()
     known[0], known[:, :, 0] = 0.0, 0.0
-    np.testing.assert_allclose(hg.fusion.matrix_weights(known)[:, 0], np.eye(2), atol=1e-9)
-    np.testing.assert_allclose(hg.fusion.matrix_weights(item * 1e-20), alone, rtol=1e-9)
+    np.testing.assert_allclose(hg.fusion.MatrixWeights().weights(known)[:, 0], np.eye(2), atol=1e-9)
+    np.testing.assert_allclose(hg.fusion.MatrixWeights().weights(item * 1e-20), alone, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

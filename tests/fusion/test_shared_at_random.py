@@ -103,7 +103,7 @@ def check_what_holds(d, net):
     matrix, with_mean, everything = (float(np.trace(fused[name][-1])) for name in RULES)
     assert everything <= with_mean * (1 + 1e-7) and with_mean <= matrix * (1 + 1e-7)
     two = cross.joint[:2][:, :, :2]
-    weights = hg.fusion.matrix_weights(two)
+    weights = hg.fusion.MatrixWeights().weights(two)
     without = np.trace(np.einsum("aib,ibjc,djc->ad", weights, two, weights))
     assert abs(matrix - without) <= 1e-7 * without
     assert set(net.claims()["fused"].values()) == {"exact"}

@@ -55,7 +55,7 @@ def test_it_is_above_whatever_the_unknown_parts_have_in_common():
 def test_with_all_known_it_is_matrix_weights_and_with_nothing_known_intersection():
     known, unknown = parts(2)
     all_known = hg.fusion.fuse(hg.fusion.SplitIntersection(known), estimates(known, 0 * unknown))
-    weights = hg.fusion.matrix_weights(known)
+    weights = hg.fusion.MatrixWeights().weights(known)
     expected = np.einsum("aib,ibjc,djc->ad", weights, known, weights)
     np.testing.assert_allclose(all_known.covariance, expected, rtol=1e-6)
     nothing = hg.fusion.fuse(hg.fusion.SplitIntersection(np.zeros((3, 2, 2))), estimates(0 * known, unknown))

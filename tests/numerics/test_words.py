@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-import heliograph.serving
 from heliograph.numerics.check import TINY, InputError, array, scalar
+from heliograph.serving.message import read_message
 
 
 def unpacking(x):
@@ -196,4 +196,4 @@ def test_no_word_of_the_library_that_reads_messages_is_in_an_error(payload, came
     with pytest.raises(
         InputError, match=r"^message: expected a JSON object with no fields but .*" + re.escape(came) + "$"
     ):
-        hg.serving.read_message(payload)
+        read_message(payload)

@@ -71,10 +71,25 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
         hg.smoothing.planned_smoother(hg.filters.open_loop_filter(PLANT), 3, hg.smoothing.FixedInterval())
 
 
+@pytest.mark.slow
+def test_simulations_of_nine_states_smooth_as_planned():
+    """Native code of a simulation, whose matrices of 81 numbers are in memory, against the planned smoother."""
+    rng = np.random.default_rng(1)
+    plant = hg.LinearPlant(0.2 * rng.normal(size=(9, 9)), of_rank(rng, 9, 9) / 9, np.zeros(9), np.eye(9))
+    item = hg.linear_filter(plant, hg.LinearSensor(rng.normal(size=(1, 9)), 0.1), hg.perfect())
+    network = hg.Network(plant, {"a": hg.Node(item.sensor, hg.perfect(), {"linear": item})})
+    simulated = hg.monte_carlo(network, 4, 2, key=0, smooth=hg.smoothing.FixedInterval()).smoothed
+    planned = hg.smoothing.planned_smoother(item, 4, hg.smoothing.FixedInterval())
+    smoothed = simulated.estimates["a"]["linear"]
+    means = hg.simulation.over_runs(planned.means, simulated.measurements["a"])
+    np.testing.assert_allclose(smoothed.mean, means, atol=CLOSE, rtol=0)
+    np.testing.assert_allclose(smoothed.covariance[0], planned.estimate.covariance, atol=CLOSE, rtol=0)
+
+
 def test_what_a_precise_future_leaves_keeps_its_digits():
     """Smoothed variances of a start that two precise positions pin down, against the limit R -> 0 of a straight line.
 
-    With Q = 0 all is found from z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2) / (T^2 + T).
+    With Q = 0 all is simulated from z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2) / (T^2 + T).
     P - P Lambda P is 1e-16 P wrong: more than the whole of the variance of v after the first step.
     """
     precise, steps = 1e-6, 6

@@ -2,18 +2,24 @@
 
 import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from textwrap import fill
 
+import rich.box
 import rich.console
+import rich.table
+from rich.text import Text
 
 from heliograph.campaign.failures import FAILURES
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.read import load_campaign
-from heliograph.campaign.run import CampaignRun, run_campaign
-from heliograph.campaign.show import print_scores, showing
-from heliograph.campaign.summary import SUMMARY, read_summary
+from heliograph.campaign.run import CampaignRun, Progress, run_campaign
+from heliograph.campaign.summary import SUMMARY, Score, read_summary, score_headers, score_row
 from heliograph.disk.quoting import visible
 from heliograph.numerics.check import fail
+from heliograph.report.progress import Countdown, counting
 
 FAILED = 1  # exit code: some work failed, the rest is there
 
@@ -76,3 +82,39 @@ def _done(run: CampaignRun) -> str:
     if not run.computed and not run.failures:
         return f"{run.folder}: nothing to compute, all {run.already} chunks are already there"
     return f"{run.folder}: {run.computed} chunks computed, {run.already} were already there"
+
+
+ROWS = 30  # of the printed table; the file has all
+
+
+@contextmanager
+def showing(workers: int) -> Iterator[Progress]:
+    """Show a progress bar on stderr; a line each minute where stderr is no terminal."""
+    countdown = Countdown(workers)
+    with counting(countdown) as show:
+
+        def progress(what: str, done: int, total: int) -> None:
+            if what == "simulating":
+                if countdown.first is None and done:
+                    print(f"{done} of {total} chunks are already there", file=sys.stderr)
+                countdown.note(done)
+            show(what, done, total)
+
+        yield progress
+
+
+def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
+    """Print the first rows of the table."""
+    table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, header in enumerate(score_headers(campaign)):
+        table.add_column(
+            Text(fill(visible(header), 7)),
+            overflow="fold",
+            justify="right" if i >= len(campaign.parameters) + 3 else "left",
+        )
+    for score in scores[:ROWS]:
+        table.add_row(*(Text(visible(cell)) for cell in score_row(campaign, score)))
+    console = rich.console.Console()
+    console.print(table)
+    if len(scores) > ROWS:
+        console.print(f"and {len(scores) - ROWS} more rows")

@@ -8,8 +8,7 @@ from pathlib import Path
 from heliograph.campaign.failures import FAILURES, Failure, read_failures
 from heliograph.campaign.figures import PANELS, campaign_figures
 from heliograph.campaign.plan import BITWISE, Campaign
-from heliograph.campaign.show import score_headers, score_row
-from heliograph.campaign.summary import SUMMARY, Score
+from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
 from heliograph.disk.quoting import visible
 from heliograph.report.figures import svg
 from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text

@@ -1,6 +1,7 @@
 """Results of a campaign: the labelled store, and a table of RMSE and NEES by setting, node and filter."""
 
 import csv
+import math
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, get_type_hints
@@ -123,6 +124,29 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
     if not len(values):
         return np.nan, np.nan
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+
+
+def score_headers(campaign: Campaign) -> list[str]:
+    """Return the headers of the table of scores."""
+    return [*campaign.parameters, "node", "filter", "claim", "RMSE", "±", "NEES / dim", "±", "finite runs"]
+
+
+def score_row(campaign: Campaign, score: Score) -> list[str]:
+    """Return a row of the table of scores: values with their standard errors."""
+    setting = campaign.settings[score.setting]
+    return [
+        *(str(setting.get(name, "")) for name in campaign.parameters),
+        score.node,
+        score.filter,
+        score.claim,
+        *(_number(score.rmse, 4), _number(score.rmse_error, 1)),
+        *(_number(score.nees_per_dimension, 3), _number(score.nees_error, 1)),
+        f"{score.finite_runs}/{campaign.runs}",
+    ]
+
+
+def _number(value: float, digits: int) -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}g}"
 
 
 def write_summary(store: Path, campaign: Campaign, path: Path) -> None:

@@ -11,10 +11,15 @@ from cyclopts import Parameter
 from heliograph.cli.app import number, path_option
 
 if TYPE_CHECKING:
-    from heliograph.learning import Share
+    from collections.abc import Callable
+
+    from heliograph.files.event_table import EventTable
+    from heliograph.files.recording import Recording
+    from heliograph.learning import Fit, Share
     from heliograph.report.fit_page import Learned
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
+    from heliograph.simulation.network import Network
 
 STEPS = 100  # that a climb takes at most
 
@@ -73,15 +78,7 @@ def learn(
     advance("starting")
     from dataclasses import replace
 
-    from heliograph.cli.run import read_mapped
-    from heliograph.files.events import event_table, holds_events
     from heliograph.files.fitted import NetworkAgain
-    from heliograph.files.network_file import load_module
-    from heliograph.files.recording import Recording, read_recording
-
-    # Learning and its page are imported when the command runs.
-    from heliograph.learning.fitting import Fit
-    from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
     from heliograph.learning.losses.losses import learn_losses_of
     from heliograph.learning.losses.stretches import fates_of_measurements
@@ -89,33 +86,16 @@ def learn(
     from heliograph.numerics.check import fail
     from heliograph.report.fit_page import Learned
 
-    build = NetworkAgain(network)
     # The network as it starts, and the data.
+    build = NetworkAgain(network)
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
-    # Rows of a table, or events, which are rows in the order of measuring.
-    messages = read_mapped(measurements, network, start, load_module(network)[1], advance)
-    if messages is None and holds_events(measurements):
-        messages = event_table(measurements, start)
-    recording = read_recording(measurements, start) if messages is None else messages.recording()
-    if truth and recording.truth is None:
-        raise fail(f"{measurements}", "columns of the true states, truth.STATE, for --truth", "none")
+    recording, messages = _data(measurements, network, start, advance, truth)
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
-    early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
-                      recording.time[:cut], None if recording.truth is None else recording.truth[:cut])  # fmt: skip
-
-    # Progress by iterations of the search.
-    def say(line: str) -> None:
-        form, _, rest = line.partition(":")
-        step = re.match(r" step ([0-9]+)", rest)
-        advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
-
-    # The fit.
-    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
-    assert isinstance(fitted, Fit)  # since no sender decides
+    fitted = _fitted(build, recording, cut, starts, seed, truth, advance)
     fitted = replace(fitted, delays={} if messages is None else messages.delays())
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
@@ -125,6 +105,52 @@ def learn(
     fates = fates_of_measurements(recording.measurements)
     losses = learn_losses_of({name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])})
     return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
+
+
+def _data(
+    measurements: Path, reference: str, network: "Network", advance: "Advance", truth: bool
+) -> "tuple[Recording, EventTable | None]":
+    """Read rows of a table, or events, which are rows in the order of measuring."""
+    from heliograph.cli.run import read_mapped
+    from heliograph.files.events import event_table, holds_events
+    from heliograph.files.network_file import load_module
+    from heliograph.files.recording import read_recording
+    from heliograph.numerics.check import fail
+
+    messages = read_mapped(measurements, reference, network, load_module(reference)[1], advance)
+    if messages is None and holds_events(measurements):
+        messages = event_table(measurements, network)
+    recording = read_recording(measurements, network) if messages is None else messages.recording()
+    if truth and recording.truth is None:
+        raise fail(f"{measurements}", "columns of the true states, truth.STATE, for --truth", "none")
+    return recording, messages
+
+
+def _fitted(
+    build: "Callable[[], Network]",
+    recording: "Recording",
+    rows: int,
+    starts: int,
+    seed: int,
+    truth: bool,
+    advance: "Advance",
+) -> "Fit":
+    """Fit to the first rows, with progress by iterations of the search."""
+    from heliograph.files.recording import Recording
+    from heliograph.learning.fitting import Fit
+    from heliograph.learning.fitting import fit as learn_from
+
+    early = Recording({k: z[:rows] for k, z in recording.measurements.items()}, recording.inputs[:rows],
+                      recording.time[:rows], None if recording.truth is None else recording.truth[:rows])  # fmt: skip
+
+    def say(line: str) -> None:
+        form, _, rest = line.partition(":")
+        step = re.match(r" step ([0-9]+)", rest)
+        advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)
+
+    fitted = learn_from(build, early, starts=starts, seed=seed, progress=say, truth=truth)
+    assert isinstance(fitted, Fit)  # since no sender decides
+    return fitted
 
 
 def results(learned: "Learned", out: Path, network: str) -> "Results":

@@ -2,9 +2,12 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from heliograph.files.inspection import Topic
 
 
 def inspect(
@@ -23,36 +26,48 @@ def inspect(
     recording:
         A bag (.mcap, .db3, .bag, or a folder), or the URL of a broker: mqtt://, nats:// or opc.tcp://.
     """
-    import rich.console
-    import rich.markup
-    import rich.table
-
     from heliograph.disk.quoting import visible
-    from heliograph.files.inspection import inspect_bag, suggestion
+    from heliograph.files.inspection import suggestion
     from heliograph.numerics.check import TINY, scalar
-    from heliograph.report.progress import progress
 
     scalar("--seconds", seconds, TINY, 86400)
-    broken = ""
     names: dict[str, tuple[str, ...]] = {}
     if network:
         from heliograph.files.network_file import load_network
 
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
-    # Look at the bag, or listen for a while.
+    # What there is, and what to paste.
+    topics, broken = _topics(recording, seconds)
+    _print_table(topics)
+    if topics:
+        print(suggestion(topics, names))
+    if broken:
+        print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
+
+
+def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
+    """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
+    from heliograph.files.inspection import inspect_bag
+    from heliograph.report.progress import progress
+
     with progress(2) as advance:
         if "://" in recording:
             from heliograph.serving.brokers.listening import listen
             from heliograph.serving.brokers.url import address
 
             advance(f"listening for {seconds:g} s")
-            topics = listen(address(recording), seconds)
-        else:
-            topics, broken = inspect_bag(
-                Path(recording), lambda done, total: advance(f"reading {recording}", done, total)
-            )
-    # A table, and what to paste.
+            return listen(address(recording), seconds), ""
+        return inspect_bag(Path(recording), lambda done, total: advance(f"reading {recording}", done, total))
+
+
+def _print_table(topics: "dict[str, Topic]") -> None:
+    import rich.console
+    import rich.markup
+    import rich.table
+
+    from heliograph.disk.quoting import visible
+
     table = rich.table.Table(
         "topic", "type", "messages", "rate", "largest gap", "late (s): median, 95 %, most", box=None
     )
@@ -60,7 +75,3 @@ def inspect(
         table.add_row(*map(rich.markup.escape, map(visible, (name, *topic.row()))))
     console = rich.console.Console(width=None if sys.stdout.isatty() else 160, highlight=False)
     console.print(table if topics else "no messages")
-    if topics:
-        print(suggestion(topics, names))
-    if broken:
-        print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
 
+    Write = Callable[[Record, Path], None]
+
 
 def read_mapped(
     measurements: Path, reference: str, network: "Network", module: Mapping[str, object], advance: "Advance"
@@ -51,9 +53,7 @@ def run(
     *,
     measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; or a bag.")],
     out: Annotated[Path | None, path_option("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
-    report: Annotated[
-        Path | None, path_option("Folder of figures and a page on estimates, innovations, links.")
-    ] = None,
+    report: Annotated[Path | None, path_option("Folder of figures, and a page on estimates and links.")] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
     window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
     lag: Annotated[float | None, Parameter(help="Of events: also estimates given what came so much later.")] = None,
@@ -71,74 +71,77 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.disk.quoting import visible
-    from heliograph.files.bag import is_bag
-    from heliograph.files.events import holds_events
-    from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
     from heliograph.smoothing.modes import named_smoothing
 
     # Check the options before JAX is imported.
-    if out is None and report is None:
-        raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
-    bag = is_bag(measurements)
-    later, events = named_smoothing(smooth), holds_events(measurements) or (bag and not smooth and report is None)
-    _check_requested(measurements, out, report, later is not None, events, window is not None or lag is not None)
-    notes: list[str] = []
-    doubtful: list[str] = []
+    later = named_smoothing(smooth)
+    events = _events_requested(measurements, out, report, later is not None, window is not None or lag is not None)
     with progress(4) as advance:
         advance("starting")
         from heliograph.files.events import run_events
-        from heliograph.files.network_file import load_module
-        from heliograph.files.recording import read_recording
 
-        # Messages of a bag become events; a network's file says which.
-        loaded, module = load_module(network)
-        if not any(loaded.claims().values()):
-            raise fail(f"network {network}", "at least one filter to run", "none")
-        messages = read_mapped(measurements, network, loaded, module, advance)
-        write = _writer(messages, module)
+        loaded, write, messages = _loaded(network, measurements, advance)
         # Filter: events through a timeline, rows at once.
-        if out is not None and (events or (messages is not None and not smooth and report is None)):
+        if out is not None and (events or (messages is not None and later is None and report is None)):
             advance("filtering events")
-            record, notes = run_events(
-                measurements, loaded, out, 10.0 if window is None else window, lag, messages, write
-            )
+            waits = 10.0 if window is None else window
+            record, lines = run_events(measurements, loaded, out, waits, lag, messages, write)
+            doubts: list[str] = []
         else:
-            recording = read_recording(measurements, loaded) if messages is None else messages.recording()
-            advance(f"filtering {len(recording.time)} rows")
-            record, doubtful = _filtered(loaded, recording, later)
-            notes = _doubted(loaded, record)
+            recording, record, lines, doubts = _filtered(loaded, measurements, messages, later, advance)
         if out is not None:
             advance(f"writing {out}")
             write(record, out)
-    if messages is not None:
-        notes += messages.notes
-        doubtful += [messages.broken] if messages.broken else []
     # Report, then warnings and a summary.
     if report is not None:
         _write_report(network, loaded, record, recording, report)
-    for line in (*record.failures(), *doubtful):
+    if messages is not None:
+        lines += messages.notes
+        doubts += [messages.broken] if messages.broken else []
+    _print_lines([*record.failures(), *doubts], [*_written(record, out, report), *lines])
+
+
+def _print_lines(warnings: list[str], summary: list[str]) -> None:
+    from heliograph.disk.quoting import visible
+
+    for line in warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
-    for line in (*_written(record, out, report), *notes):
+    for line in summary:
         print(visible(line))
 
 
-def _check_requested(
-    measurements: Path, out: Path | None, report: Path | None, smooths: bool, events: bool, waits: bool
-) -> None:
-    """Check before the work starts that the options fit together and that files can be written."""
+def _events_requested(measurements: Path, out: Path | None, report: Path | None, smooths: bool, waits: bool) -> bool:
+    """Decide whether the file is read as events; check first that the options fit together and files can be written."""
+    from heliograph.files.bag import is_bag
+    from heliograph.files.events import holds_events
     from heliograph.numerics.check import fail
 
+    if out is None and report is None:
+        raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
+    events = (is_bag(measurements) and not smooths and report is None) or holds_events(measurements)
     if events and (out is None or report is not None or smooths):
         raise fail("--smooth and --report", f"rows of time, and --out FILE alone for events such as {measurements}",
                    "events")  # fmt: skip
     if not events and waits:
         raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
     _check_places(measurements, out, report)
+    return events
 
 
-def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Callable[[Record, Path], None]":
+def _loaded(reference: str, measurements: Path, advance: "Advance") -> "tuple[Network, Write, EventTable | None]":
+    """Load the network, the function that writes its estimates, and the events of the file's messages."""
+    from heliograph.files.network_file import load_module
+    from heliograph.numerics.check import fail
+
+    network, module = load_module(reference)
+    if not any(network.claims().values()):
+        raise fail(f"network {reference}", "at least one filter to run", "none")
+    messages = read_mapped(measurements, reference, network, module, advance)
+    return network, _writer(messages, module), messages
+
+
+def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
     """Return the function that writes estimates: to a table, or to MCAP with the pose that the network's file names."""
     from heliograph.files.bag_output import write_bag
     from heliograph.files.recording import write_estimates
@@ -155,13 +158,21 @@ def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "C
 
 
 def _filtered(
-    network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
-) -> tuple["Record", list[str]]:
-    """Return the record, and warnings."""
+    network: "Network",
+    measurements: Path,
+    messages: "EventTable | None",
+    smooth: "AbstractSmoothing | None",
+    advance: "Advance",
+) -> tuple["Recording", "Record", list[str], list[str]]:
+    """Filter rows; return them, the record, what the filters doubted in lines, and warnings."""
+    from heliograph.files.recording import read_recording
+
+    recording = read_recording(measurements, network) if messages is None else messages.recording()
+    advance(f"filtering {len(recording.time)} rows")
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         record = heliograph.run(network, *recording, smooth=smooth)
-    return record, [str(doubt.message) for doubt in doubts]
+    return recording, record, _doubted(network, record), [str(doubt.message) for doubt in doubts]
 
 
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:

@@ -19,7 +19,6 @@ from .wrappers.delay import (
     part_filter as part_filter,
 )
 from .wrappers.fed_back import (
-    FedBackFilter as FedBackFilter,
     fed_back_filter as fed_back_filter,
 )
 from .gaussian.gaussian import (
@@ -96,7 +95,7 @@ from .linear.truth import (
     TrueError as TrueError,
     true_error as true_error,
 )
-from .weights import (
+from .gaussian.robust import (
     Gate as Gate,
     Huber as Huber,
     InverseMultiquadric as InverseMultiquadric,

@@ -48,8 +48,3 @@ from .rules import (
 from .split import (
     SplitIntersection as SplitIntersection,
 )
-from .weights import (
-    diagonal_weights as diagonal_weights,
-    matrix_weights as matrix_weights,
-    scalar_weights as scalar_weights,
-)

@@ -8,16 +8,19 @@ import jax.numpy as jnp
 
 from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
 from heliograph.fusion.mesh.gains import Believed, Weights
-from heliograph.fusion.mesh.weights import (
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.fusion.weights import (
     SHORT,
     arrived_scalar_weights,
     arrived_weights,
     arrived_weights_by_component,
     component_weights,
+    diagonal_weights,
+    matrix_weights,
+    scalar_weights,
+    weighted,
     weighted_by_component,
 )
-from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
-from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, Bool, Float, PyTree
@@ -85,7 +88,7 @@ class AbstractWeights(AbstractInformedFusion):
         """Always True."""
         return True
 
-    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Compute W from P."""
         raise NotImplementedError
 
@@ -135,7 +138,7 @@ class MatrixWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
@@ -157,7 +160,7 @@ class DiagonalWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
 
@@ -189,7 +192,7 @@ class ScalarWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)
 

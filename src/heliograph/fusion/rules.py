@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.intersection import (
+    equal_shares,
     intersect,
     intersect_inversely,
+    intersection_weights,
     inverses,
     trace_optimal_weights,
+    trace_shares,
     without_known,
 )
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, gains_of
 from heliograph.fusion.mesh.graph import Graph, Neighbours, neighbours_of
-from heliograph.fusion.mesh.shares import equal_shares, intersection_weights, trace_shares
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.fusion.report_link import ReportLink, ReportLinks
 from heliograph.model.channel import Channel

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
 from heliograph.h_infinity.system import Growth, GrowthSystem, smallest_eigenvalue, symmetric_weight
-from heliograph.numerics.check import array, fail, instance, items, scalar
+from heliograph.numerics.check import TINY, array, fail, instance, items, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -82,11 +82,9 @@ def certify_level(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level))
+    level = float(scalar("level", level, TINY))
     findings = {"f": _findings("growth", growth), "h": _findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
-    if not level > 0:
-        raise fail("level", "a positive number", level)
     K = array("gains", gains, (T, n, m))
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _multipliers(array("multipliers", multipliers, (T, None)))
@@ -205,14 +203,26 @@ def theorem_matrix(
     phi[n : 2 * n, n : 2 * n] += M.T @ M
     sizes = [level**2] * (v + r)
     phi[4 * n + 2 * y :, 4 * n + 2 * y :] -= np.diag(sizes)
-    # + sum_i lambda_i (a_i^2 |argument|^2 - |value|^2): the growth conditions
+    _add_growth(phi, at, y, system, k, multipliers)
+    return _without_absent(phi, at, y, system)
+
+
+def _add_growth(
+    phi: Float[np.ndarray, "q q"],
+    at: dict[str, int],
+    y: int,
+    system: GrowthSystem,
+    k: int,
+    multipliers: Float[np.ndarray, "4"],
+) -> None:
+    """Add the growth conditions of step k: sum_i lambda_i (a_i^2 |argument|^2 - |value|^2)."""
+    n = system.states
     constants = [growth[k] for pair in (system.growth, system.output_growth) for growth in pair]
     for i, (constant, weight_of) in enumerate(zip(constants, multipliers, strict=True)):
         width, value_at, point_at = (n, n, y, y)[i], at["fghd"[i]], at["xexe"[i]]
         value, point = slice(value_at, value_at + width), slice(point_at, point_at + n)
-        phi[value, value] -= weight_of * eye(width)
-        phi[point, point] += weight_of * constant**2 * eye(n)
-    return _without_absent(phi, at, y, system)
+        phi[value, value] -= weight_of * np.eye(width)
+        phi[point, point] += weight_of * constant**2 * np.eye(n)
 
 
 def _without_absent(

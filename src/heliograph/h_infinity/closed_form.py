@@ -5,7 +5,7 @@ import numpy as np
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.step import StepMatrices, step_matrices
 from heliograph.h_infinity.system import GrowthSystem
-from heliograph.numerics.check import array, fail, instance, scalar
+from heliograph.numerics.check import TINY, array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 
 SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
@@ -33,11 +33,9 @@ def known_channel_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, high=GREATEST))
+    level = float(scalar("level", level, TINY, GREATEST))
     if any(len(link.spreads()) for link in system.channel):
         raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
-    if not level > 0:
-        raise fail("level", "a positive number", level)
     given = np.zeros((system.steps, 2)) if multipliers is None else array("multipliers", multipliers, (system.steps, 2))
     for growth, column, name in ((system.growth, 0, "f~"), (system.output_growth, 1, "h~")):
         if not growth.absent and np.any(given[:, column] <= 0):

@@ -29,7 +29,7 @@ from heliograph.h_infinity.step import (
     step_matrices,
 )
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
-from heliograph.numerics.check import array, fail, instance, scalar
+from heliograph.numerics.check import TINY, array, fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -100,8 +100,8 @@ def recursive_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    if level is not None and float(scalar("level", level)) <= 0:
-        raise fail("level", "a positive number", level)
+    if level is not None:
+        scalar("level", level, TINY)
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _weight(initial, system.states)
@@ -168,14 +168,13 @@ def horizon_design(
         text = f"the solver's answer fails at step {failed} ({status})"
         return _empty(system, separate, float("nan"), text)._replace(failed_step=failed)
     # back to the user's units
-    level = float(np.sqrt(square)) * coordinates.unit
     chosen = given_gains
     if chosen is None:
         chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(solved)])
     multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     proven = all_multipliers(system, multipliers, separate)
-    return HInfinityDesign(level, chosen, unscaled, proven, True, status)
+    return HInfinityDesign(float(np.sqrt(square)) * coordinates.unit, chosen, unscaled, proven, True, status)
 
 
 def _first_failing(

@@ -10,23 +10,15 @@ from .likelihood.predictive_density import (
 )
 from .losses.delays import (
     Delays as Delays,
-    learn_delays as learn_delays,
-)
-from .losses.hidden_losses import (
-    HiddenModeLosses as HiddenModeLosses,
 )
 from .losses.loss_law import (
     AbstractLossLaw as AbstractLossLaw,
-    IndependentLosses as IndependentLosses,
-    MarkovLosses as MarkovLosses,
 )
 from .losses.losses import (
     LossMemory as LossMemory,
-    loss_memory as loss_memory,
     Losses as Losses,
     learn_losses as learn_losses,
     learn_losses_of as learn_losses_of,
-    RunningRateLosses as RunningRateLosses,
 )
 from .losses.shares import (
     Share as Share,

@@ -102,11 +102,7 @@ def lifted_modes(
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
         law = _stays(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
-        # Measurement noise: its mean over the modes.
-        noise = np.zeros((1, 1))
-        for p, matrix, route in zip(law, means, measurement.maps, strict=True):
-            arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
-            noise = noise + p * (np.asarray(arrives) - matrix @ after @ matrix.T)
+        noise = _mean_noise(law, means, measurement.maps, degree, moments)
         output = np.concatenate(list(means), axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
         step_matrices.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
@@ -114,6 +110,21 @@ def lifted_modes(
         before, rows = after, np.asarray(measurement.transition)
     steps = Steps(*(over_horizon(values, len(plants)) for values in zip(*step_matrices, strict=True)))
     return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
+
+
+def _mean_noise(
+    law: Float[np.ndarray, " modes"],
+    means: Float[Array, "modes z Y"],
+    routes: Sequence[AbstractRandomAffine],
+    degree: int,
+    moments: Moments,
+) -> Float[np.ndarray, "N N"]:
+    """Measurement noise in the mean over the modes, sum_j p_j (E[Z Z' | j] - K_j E[Y Y'] K_j')."""
+    signal, noise = second_moments(moments, routes[0].inputs + 1, degree), np.zeros((1, 1))
+    for p, matrix, route in zip(law, means, routes, strict=True):
+        arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
+        noise = noise + p * (np.asarray(arrives) - matrix @ signal @ matrix.T)
+    return noise
 
 
 def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:

@@ -1,8 +1,8 @@
-"""Smoothing of an earlier moment by the later rows of a history: the program that sweeps back over them."""
+"""Rows in order, their history, and the program that sweeps back over them to smooth an earlier moment."""
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
-from heliograph.live.history import History
 from heliograph.live.row_step import NetworkStep
 from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate, with_sound_claim
@@ -24,6 +23,43 @@ from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.judging import reasons
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
+
+
+class History(NamedTuple):
+    """Rows in order: measurements of all nodes, inputs (NaN where none was given), and the time.
+
+    For each row there are also the filters' states after it, the inputs held, the step number, and the outputs.
+
+    Shapes: rows (row, received + given + 1), held (row, given), step (row,).
+    """
+
+    rows: jax.Array | np.ndarray
+    state: PyTree
+    held: jax.Array | np.ndarray
+    step: jax.Array | np.ndarray
+    outputs: PyTree
+
+    def parts(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the measurements, the inputs and the time of a row."""
+        given = self.held.shape[1]
+        numbers = self.rows[row]
+        return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
+
+    def known(self, row: jax.Array) -> PyTree:
+        """Return the filters' states after a row."""
+        return jax.tree.map(lambda leaf: leaf[row], self.state)
+
+    def interval(self, row: jax.Array, dt: int) -> jax.Array:
+        """Return the inputs of a plant of continuous time since the row before, as held then."""
+        return jnp.insert(self.held[row - 1], dt, self.parts(row)[2] - self.parts(row - 1)[2])
+
+    def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
+        received, given, last = self.parts(row)
+        there, held = k == last.astype(self.step.dtype), self.held[row - 1]
+        u = jnp.where(there, jnp.where(jnp.isnan(given), held, given), held)
+        return jnp.where(there, received, jnp.nan), u
+
 
 SmootherStep: TypeAlias = (
     "tuple[dict[int, AbstractSmootherStep], dict[str, AbstractSmootherStep]]"  # by kind, and by name

@@ -8,7 +8,6 @@ from .service import (
 )
 from .message import (
     Message as Message,
-    read_message as read_message,
 )
 from .brokers.opcua import (
     Reporting as Reporting,
@@ -18,7 +17,6 @@ from .output import (
     Estimates as Estimates,
     Output as Output,
     Refused as Refused,
-    FilterOutput as FilterOutput,
 )
 from .storage.store_protocol import (
     InMemoryStore as InMemoryStore,
@@ -54,7 +52,6 @@ from .brokers.contract import (
 )
 from .brokers.replay import (
     Link as Link,
-    along as along,
     lines as lines,
     recorded as recorded,
     through as through,

@@ -104,16 +104,11 @@ class Using:
         if refused:
             why = refused.get((number, event.node_index < 0)) or why
             spoilt = refused.get((number, True)) if inputs is not None else None
-        if plant is None:
-            if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
-                return None, "future", "", ()
-            if why and (inputs is None or spoilt):
-                return None, "implausible", why, ()
-            plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
-            self._before[plant.name] = Before(False, at, {})
-        elif plant.name not in self._before:
-            links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
-            self._before[plant.name] = Before(True, plant.now, links)
+        if plant is None and at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
+            return None, "future", "", ()
+        if plant is None and why and (inputs is None or spoilt):
+            return None, "implausible", why, ()
+        plant = self._remembered(plant or self.fleet.begin(message.plant, at, origin), at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
@@ -129,6 +124,16 @@ class Using:
         if beyond and verdict == "used":
             notes.append(f"{beyond}; the rest is used")
         return plant, verdict, why, notes
+
+    def _remembered(self, plant: Plant, begun: float) -> Plant:
+        """Return the plant, and store once in a batch what it was before; a new one joins the others."""
+        if plant.name not in self.plants:
+            self.plants[plant.name] = plant
+            self._before[plant.name] = Before(False, begun, {})
+        elif plant.name not in self._before:
+            links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
+            self._before[plant.name] = Before(True, plant.now, links)
+        return plant
 
     def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
         """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""

@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .arrivals import (
+from .transmission import (
     arrivals as arrivals,
 )
 from .centres.before_data import (

@@ -82,28 +82,16 @@ def run(
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
-    # Values beyond a node's limits did not arrive.
-    for name in network.names:
-        z[name] = _within(name, network.nodes[name], z[name])
-        # Values that the rule of a sender forbids.
-        if rows := forbidden_rows(network.nodes[name], z[name]):
-            warnings.warn(
-                f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
-                "within delta of the value before, and no heartbeat due",
-                stacklevel=2,
-            )
-    # Filters, and what became of the reports.
+    for name, node in network.nodes.items():
+        z[name] = _within(name, node, z[name])
+        _warn_of_forbidden(name, node, z[name])
+    # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
     with jax.enable_x64(True):
-        recorded_reports = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals: dict[str, PyTree] = {
-            name: centre.uplinks.recorded(name, centre.nodes, recorded_reports.get(name), steps)
-            for name, centre in filters.reporting.items()
-        } | {
-            name: mesh.edges.recorded(name, mesh.nodes, recorded_reports.get(name), steps)
-            for name, mesh in filters.meshes.items()
-        }
+        arrivals = _reports_of(
+            filters, {} if reports is None else table("reports", reports, "reports by fusion"), steps
+        )
         outputs = _plausible(network, z, (filters, smoothing and smoothing.smoother(filters), u, arrivals))
     record = record_of(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
@@ -121,6 +109,27 @@ def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m
         f"node {name!r}: {count} of {z.size} values count as not arrived; row {row + 1}: {said}", stacklevel=3
     )
     return np.where(outside, np.nan, z)
+
+
+def _warn_of_forbidden(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m"]) -> None:
+    if rows := forbidden_rows(node, z):
+        warnings.warn(
+            f"node {name!r}: {len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
+            "within delta of the value before, and no heartbeat due",
+            stacklevel=3,
+        )
+
+
+def _reports_of(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
+    """Return what arrived of reports and between neighbours, by fusion."""
+    arrivals: dict[str, PyTree] = {
+        name: centre.uplinks.recorded(name, centre.nodes, reports.get(name), steps)
+        for name, centre in filters.reporting.items()
+    }
+    of_meshes = {
+        name: mesh.edges.recorded(name, mesh.nodes, reports.get(name), steps) for name, mesh in filters.meshes.items()
+    }
+    return arrivals | of_meshes
 
 
 def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:

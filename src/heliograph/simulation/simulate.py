@@ -88,11 +88,7 @@ def monte_carlo(
     """
     check_process()
     instance("network", network, Network, "a Network")
-    # Counts, inputs and key.
-    for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
-        check_count(name, count)
-    if check_count("first_run", first_run, 0) % BLOCK:
-        raise fail("first_run", f"a multiple of {BLOCK}", first_run)
+    _check_counts(horizon, runs, chunk, first_run)
     network.check_horizon(horizon)
     reducer = cast(AbstractReducer[Result], Trajectories()) if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
@@ -114,6 +110,13 @@ def monte_carlo(
         network = network.in_single_precision()
         smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
     return finished(reducer, recorded, network, smoothing)
+
+
+def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
+    for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
+        check_count(name, count)
+    if check_count("first_run", first_run, 0) % BLOCK:
+        raise fail("first_run", f"a multiple of {BLOCK}", first_run)
 
 
 def _is_single(precision: Precision, network: Network) -> bool:

@@ -66,25 +66,16 @@ def rescaled(filter: AbstractFilter, units: Units) -> AbstractFilter:
     s = units.states
     # x -> S x: mean S m, covariance S P S; plant, sensor and channel in the new units.
     match filter:
-        case GaussianFilter():
-            return replace(
-                filter,
-                plant=rescaled_plant(filter.plant, units),
-                sensor=rescaled_sensor(filter.sensor, units),
-                channel=_channel(filter.channel, units),
-                initial_mean=s * filter.initial_mean,
-                initial_covariance=np.outer(s, s) * filter.initial_covariance,
-            )
+        case GaussianFilter() | OpenLoop():
+            plant, mean = rescaled_plant(filter.plant, units), s * filter.initial_mean
+            covariance = np.outer(s, s) * filter.initial_covariance
+            moved = replace(filter, plant=plant, initial_mean=mean, initial_covariance=covariance)
+            if isinstance(moved, OpenLoop):
+                return moved
+            return replace(moved, sensor=rescaled_sensor(moved.sensor, units), channel=_channel(moved.channel, units))
         case LinearFilter():
             plant, sensor = rescaled_plant(filter.plant, units), rescaled_sensor(filter.sensor, units)
             return replace(filter, plant=plant, sensor=sensor, channel=_channel(filter.channel, units))
-        case OpenLoop():
-            return replace(
-                filter,
-                plant=rescaled_plant(filter.plant, units),
-                initial_mean=s * filter.initial_mean,
-                initial_covariance=np.outer(s, s) * filter.initial_covariance,
-            )
         case MixtureFilter():
             return replace(
                 filter, plant=rescaled_plant(filter.plant, units), components=_components(filter.components, units)

@@ -207,7 +207,7 @@ def _root_simulated(net: hg.Network, setting: Setting) -> dict[str, float]:
     errors = np.stack([record.errors(name, LOCAL)[:, -1] for name in alone.names], axis=1)
     for level, size in zip(levels, (3, 2, 2), strict=True):
         groups = [slice(i, i + size) for i in range(0, len(level.nodes), size)]
-        weights = [hg.fusion.matrix_weights(level.joint[g][:, :, g]) for g in groups]
+        weights = [hg.fusion.MatrixWeights().weights(level.joint[g][:, :, g]) for g in groups]
         pairs = zip(groups, weights, strict=True)
         errors = np.stack([np.einsum("aib,kib->ka", w, errors[:, g]) for g, w in pairs], axis=1)
     return against_peers(np.trace(levels[-1].matrix_weights()[1]), errors[:, 0])

@@ -7,7 +7,9 @@ from scipy.special import expit, logit
 from scipy.stats import binomtest, chi2_contingency
 
 import heliograph as hg
-from heliograph.learning.losses.hidden_losses import Runs
+from heliograph.learning.losses.hidden_losses import HiddenModeLosses, Runs
+from heliograph.learning.losses.loss_law import IndependentLosses, MarkovLosses
+from heliograph.learning.losses.losses import loss_memory
 from heliograph.numerics.shares import wilson
 
 NAN = np.nan
@@ -52,7 +54,7 @@ def test_the_hidden_modes_likelihood_is_the_sum_over_all_modes():
     shares = expit(LOGITS)
     expected = sum(np.log(by_enumeration(part, *shares)) for part in BURSTS)
     assert Runs.of(BURSTS).likelihood(LOGITS)[0] == pytest.approx(expected, rel=1e-13)
-    law = hg.learning.HiddenModeLosses(*map(share, shares))
+    law = HiddenModeLosses(*map(share, shares))
     assert np.nansum(law.log_likelihoods(BURSTS)) == pytest.approx(expected, rel=1e-13)
 
 
@@ -91,14 +93,14 @@ def test_the_profile_falls_by_half_the_chi_square_point_at_the_ends_of_an_interv
 
 
 def test_counts_are_the_estimates_of_a_chain():
-    law = hg.learning.MarkovLosses.fit(BURSTS)
+    law = MarkovLosses.fit(BURSTS)
     np.testing.assert_array_equal(law.counts, [[2, 1], [2, 2]])  # pairs across NaN and between stretches do not count
     assert law.shares()["fail"].estimate == 1 / 3 and law.shares()["recover"].estimate == 1 / 2
-    assert hg.learning.IndependentLosses.fit(BURSTS).shares()["loss"].estimate == 0.5
+    assert IndependentLosses.fit(BURSTS).shares()["loss"].estimate == 0.5
 
 
 def test_a_past_is_used_as_far_as_it_is_known():
-    law = hg.learning.MarkovLosses(np.array([[7, 1], [2, 2], [4, 0], [1, 3.0]]))  # after 00, 01, 10, 11
+    law = MarkovLosses(np.array([[7, 1], [2, 2], [4, 0], [1, 3.0]]))  # after 00, 01, 10, 11
     said = law.predicted(np.array([1, 0, NAN, 1, 1, 0.0]))
     assert said.tolist() == [6.5 / 21, 5.5 / 9, 0.5 / 5, 6.5 / 21, 5.5 / 9, 3.5 / 5]
 
@@ -121,8 +123,8 @@ def test_the_running_rate_is_a_recursion(learned, bursts):
 
 
 def test_tests_of_memory_are_the_known_ones(bursts):
-    result = hg.learning.loss_memory(bursts)
-    table = hg.learning.MarkovLosses.fit(bursts).counts
+    result = loss_memory(bursts)
+    table = MarkovLosses.fit(bursts).counts
     expected = chi2_contingency(table, correction=False, lambda_="log-likelihood")
     assert result.likelihood_ratio == pytest.approx(expected.statistic, rel=1e-10)
     assert result.significant and result.runs_z < -5
@@ -131,13 +133,13 @@ def test_tests_of_memory_are_the_known_ones(bursts):
 def test_tests_of_memory_find_none_where_there_is_none():
     """2,000 recordings of 300 independent losses: a test at 5 % rejects 5 %, to three standard errors."""
     drawn = (np.random.default_rng(1).random((2000, 300)) < 0.3).astype(float)
-    results = [hg.learning.loss_memory(item) for item in drawn]
+    results = [loss_memory(item) for item in drawn]
     for p in ("likelihood_p", "runs_p"):
         assert np.mean([getattr(item, p) < 0.05 for item in results]) == pytest.approx(0.05, abs=0.0146)
 
 
 def test_nothing_that_varies_is_no_evidence():
-    result = hg.learning.loss_memory(np.zeros(20))
+    result = loss_memory(np.zeros(20))
     assert (result.likelihood_p, result.runs_p) == (1.0, 1.0)
 
 
@@ -170,7 +172,7 @@ def test_a_law_is_a_channel_with_its_losses(learned, name):
         keys = jax.random.split(jax.random.key(3), 4000)
         lost = np.isnan(np.asarray(jax.lax.scan(step, channel.init(keys[0]), keys)[1]))
     assert lost.mean() == pytest.approx(learned.lost / learned.packets, abs=0.045)
-    law = hg.learning.MarkovLosses.fit(lost.astype(float)).shares()
+    law = MarkovLosses.fit(lost.astype(float)).shares()
     truth = learned.laws["markov"].shares()["recover"].estimate if name != "independent" else 1 - lost.mean()
     assert law["recover"].estimate == pytest.approx(truth, abs=0.09)
 

@@ -1,6 +1,5 @@
 """Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
@@ -9,12 +8,12 @@ import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.operations import BITS
-from heliograph.codegen.llvm.text import Slots, Writer, loops_of
+from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.nodes import Buffer, Guard, Loop, Node, Store, Unsupported
-from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, varying
+from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, uses, varying
 from heliograph.codegen.rules.loops import copied
 from heliograph.codegen.rules.random_bits import hash_function
 from heliograph.codegen.vectors.elementary import functions
@@ -128,13 +127,16 @@ def written(
         width,
         0,
     )
-    shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0)
+    differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
+    mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
+    # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
+    turning = {b for b in _read(mine) if b not in spread and b.kind == "scratch" and loops_of(b.block)}
+    shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0, turning)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
-    differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
-    mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
     blocks = Writer(width, mine, products, spread, slots)
+    blocks.turning = turning
     text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
     text = _with_functions(text, blocks)
     # The other function fills these slots, once for all runs.
@@ -143,6 +145,7 @@ def written(
     once = None
     if roots:
         writer = Writer(1, needed(roots), products, set(), slots)
+        writer.turning = turning
         once = _source(_with_functions(_once(writer, program, pointers, in_shared), writer), writer.mine)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
@@ -152,9 +155,15 @@ def written(
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
     """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
-    read = {x.value[0].owner[0] for x in items if isinstance(x, Node) and x.op == "load"}
+    read = _read(items)
     if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")
+
+
+def _read(items: Iterable[Any]) -> set[Buffer]:
+    """Return the buffers that these items, or what they use directly, load numbers of."""
+    nodes = (node for x in items for node in (x, *uses(x)) if isinstance(node, Node))
+    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 
 def sorted_items(items: Iterable[Any]) -> list[Any]:
@@ -165,16 +174,19 @@ def sorted_items(items: Iterable[Any]) -> list[Any]:
 def _source(text: str, items: Iterable[Any]) -> Source:
     """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
     counts = Counter(x.block for x in items if isinstance(x, Node))
-    turns = {block: math.prod(loop.length or 1 for loop in loops_of(block)) for block in counts}
+    turns = {block: turns_of(block) for block in counts}
     return Source(text, counts.total(), sum(count * turns[block] for block, count in counts.items()))
 
 
-def _places(buffers: Iterable[Buffer], width: int, start: int) -> tuple[int, dict[Buffer, int]]:
-    """Place buffers one after another; return the end and each one's offset, in bytes."""
+def _places(
+    buffers: Iterable[Buffer], width: int, start: int, turning: Collection[Buffer] = ()
+) -> tuple[int, dict[Buffer, int]]:
+    """Place buffers one after another; return the end and each one's offset, in bytes; of some one for each turn."""
     places: dict[Buffer, int] = {}
     for buffer in buffers:
         places[buffer] = start
-        start += -(-buffer.size * width * BITS[buffer.type] // 8 // LINE) * LINE
+        copies = turns_of(buffer.block) if buffer in turning else 1
+        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
     return start, places
 
 

@@ -3,6 +3,7 @@
 What the second computes is in memory between them, in `Slots`.
 """
 
+import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -28,10 +29,7 @@ class Slots:
         """Return the offset of a number, assigned at its first use."""
         if node not in self.places:
             self.places[node] = self.size
-            turns = 1
-            for loop in loops_of(node.block):
-                turns *= loop.length or 1
-            self.size += 8 * turns
+            self.size += 8 * turns_of(node.block)
         return self.places[node]
 
     def load(self, writer: "Writer", node: Node) -> str:
@@ -53,19 +51,18 @@ class Slots:
         writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
     def _address(self, writer: "Writer", node: Node) -> str:
-        offset, stride, index = self.offset_of(node), 8, ""
-        for loop in loops_of(node.block):
-            assert loop.counter is not None
-            step = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
-            index = writer.add(f"add i64 {index}, {step}") if index else step
-            stride *= loop.length or 1
-        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {offset}")
-        return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
+        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {self.offset_of(node)}")
+        return writer.of_turn(start, node.block, 8)
 
 
 def loops_of(block: Block) -> list[Loop]:
     """Return the loops around a block's nodes, innermost first."""
     return [b.owner for b in block.inwards() if isinstance(b.owner, Loop)]
+
+
+def turns_of(block: Block) -> int:
+    """Return how many turns the loops around a block's nodes make together; of unknown length one."""
+    return math.prod(loop.length or 1 for loop in loops_of(block))
 
 
 class Writer:
@@ -84,6 +81,7 @@ class Writer:
         self.called: set[str] = set()
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
+        self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
         self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
         self.counted = ""  # the lanes that count
 
@@ -174,7 +172,7 @@ class Writer:
         """Return the address of entry offset + sum strides * indices, for entries of this many lanes."""
         owner, start = buffer.owner
         element = f"[{lanes} x i{BITS[owner.type]}]"
-        base = self.bases[owner]
+        base = self._base(owner)
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
             row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
@@ -186,6 +184,27 @@ class Writer:
                 row = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {moved}")
             base = row
         return self.add(f"getelementptr {element}, ptr {base}, i64 {offset + start}")
+
+    def _base(self, owner: Buffer) -> str:
+        """Return the address of a buffer's memory, in this turn of the loops around it."""
+        if owner not in self.turning:
+            return self.bases[owner]
+        key = ("base", owner)
+        base = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+        if base is None:
+            bytes_ = owner.size * BITS[owner.type] // 8
+            base = self.scopes[-1][key] = self.of_turn(self.bases[owner], owner.block, bytes_)
+        return base
+
+    def of_turn(self, start: str, block: Block, bytes_: int) -> str:
+        """Return the address that belongs to this turn of the loops around a block; each turn has so many bytes."""
+        index = ""
+        for loop in loops_of(block):
+            assert loop.counter is not None
+            step = self.add(f"mul i64 {self.scalar(loop.counter)}, {bytes_}")
+            index = self.add(f"add i64 {index}, {step}") if index else step
+            bytes_ *= loop.length or 1
+        return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
     def _load(self, node: Node) -> str:
         buffer, offset, strides = node.value
@@ -226,10 +245,10 @@ class Writer:
             positions = self.add(f"add {wide} {positions}, <{numbers}>")
         # One load for each lane; booleans are stored as bytes.
         bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
-        loaded = "poison"
+        base, loaded = self._base(owner), "poison"
         for lane in range(self.width):
             at = self.add(f"extractelement {wide} {positions}, i64 {lane}")
-            address = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, i64 {at}")
+            address = self.add(f"getelementptr i{bits}, ptr {base}, i64 {at}")
             entry = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
             loaded = self.add(f"insertelement {values} {loaded}, i{bits} {entry}, i64 {lane}")
         if node.type == "bool":

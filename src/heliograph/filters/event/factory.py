@@ -86,14 +86,8 @@ def event_filter(
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _claim_of(plant, sensor, channel, trigger)
         return StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received))
-    # A threshold: which losses and regions the sum holds.
-    expected = "SendOnDelta, SendOnPredictionError or another of these"
-    threshold = instance("trigger", trigger, AbstractThreshold, expected)
-    if not lost and loses and threshold.reference == "sent":
-        raise fail("lost", "at least 1, since transmissions may be lost", lost)
-    _check_region(threshold, outputs, first(channel).outputs, steps)
     return EventFilter(
-        trigger=threshold,
+        trigger=_threshold(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,
         lost=lost,
         delivers=all(_delivers(step) for step in steps),
@@ -184,10 +178,15 @@ def _delivers(channel: SideInformation) -> bool:
     )
 
 
-def _check_region(trigger: AbstractThreshold, outputs: int, received: int, steps: list[SideInformation]) -> None:
-    """Refuse what the sum of Gaussians does not carry."""
+def _threshold(
+    rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[SideInformation]
+) -> AbstractThreshold:
+    """Return the rule where the sum of Gaussians carries its regions and losses (`lost`: None if there are none)."""
+    trigger = instance("trigger", rule, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these")
+    if lost == 0 and trigger.reference == "sent":
+        raise fail("lost", "at least 1, since transmissions may be lost", lost)
     if outputs == 1:
-        return
+        return trigger
     if trigger.region == "ball" and outputs > MOST_COMPONENTS:
         raise fail(
             "outputs of a sensor behind a ball", f"{MOST_COMPONENTS} at most, for which a filter can cut to it", outputs
@@ -198,6 +197,7 @@ def _check_region(trigger: AbstractThreshold, outputs: int, received: int, steps
         if not all(_one_by_one(step) for step in steps):
             raise fail("channel of components that are each sent alone", "links side by side that lose them one by one "
                        "and remember nothing, such as parallel([erasure(perfect(), .9)] * 2)", "another")  # fmt: skip
+    return trigger
 
 
 def _one_by_one(channel: SideInformation) -> bool:

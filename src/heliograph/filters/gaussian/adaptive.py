@@ -165,14 +165,12 @@ def _learn(
         last, noise = noise, jnp.where(received, learned / after_shape, noise)
     # The state with the last variances.
     if law is not None:
-        branches = _scaled(law, last / variance)
-        corrected = score_update(before, z, *branches)
+        corrected = score_update(before, z, *_scaled(law, last / variance))
         x, p = corrected.mean, corrected.covariance
     else:
         x, p = joint_update(before, e, received, used)
-    after = AdaptiveBelief(
-        x, p, jnp.where(received, after_shape, state.shape), jnp.where(received, noise * after_shape, state.scale)
-    )
+    a, b = jnp.where(received, after_shape, state.shape), jnp.where(received, noise * after_shape, state.scale)
+    after = AdaptiveBelief(x, p, a, b)
     return Learned(after, before.spread + diagonal(scale / shape), jnp.where(arrived, shown, jnp.nan))
 
 

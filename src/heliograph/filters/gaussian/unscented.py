@@ -10,7 +10,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike, Float, Scalar
@@ -48,10 +48,8 @@ class Unscented(AbstractTransform):
     kappa: Scalar
 
     def __init__(self, alpha: Scalar = 1e-3, beta: Scalar = 2.0, kappa: Scalar = 0.0):
-        self.alpha, self.beta = scalar("alpha", alpha), scalar("beta", beta)
+        self.alpha, self.beta = scalar("alpha", alpha, TINY), scalar("beta", beta)
         self.kappa = scalar("kappa", kappa)
-        if not is_traced(self.alpha) and self.alpha <= 0:
-            raise fail("alpha", "a positive number", alpha)
 
     def check(self, n: int) -> None:
         """Raise ValueError where there are no such points of n states, or their covariance may be indefinite."""

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import chosen
+from heliograph.fusion.intersection import intersection_weights, trace_shares
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
 from heliograph.fusion.mesh.graph import Graph
-from heliograph.fusion.mesh.shares import intersection_weights, trace_shares
 from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import check_count, fail, scalar, table
