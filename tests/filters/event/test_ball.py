@@ -9,7 +9,6 @@ from heliograph.filters.event.ball import ball_moments, cut_to_ball
 from heliograph.filters.event.parts import Parts
 from heliograph.numerics.float64 import compiled
 
-
 # One program for each side and number of components, whatever the numbers.
 moments_in_ball = {side: compiled(partial(ball_moments, inside=side)) for side in (True, False)}
 
