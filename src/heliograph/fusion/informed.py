@@ -88,7 +88,7 @@ class AbstractWeights(AbstractInformedFusion):
         """Always True."""
         return True
 
-    def weights(self, joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Compute W from P."""
         raise NotImplementedError
 
@@ -138,7 +138,7 @@ class MatrixWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
@@ -160,7 +160,7 @@ class DiagonalWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
 
@@ -192,7 +192,7 @@ class ScalarWeights(AbstractWeights):
 
     with_mean: bool = eqx.field(static=True, default=False)
 
-    def weights(self, joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)
 

@@ -119,7 +119,7 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     return jnp.einsum("i,ab->aib", by_node, jnp.eye(n))
 
 
-def weighted(weights: Float[jax.Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
+def weighted(weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
     """W P W'."""
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 

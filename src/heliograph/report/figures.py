@@ -7,9 +7,10 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-INK, MUTED, PALE, GRID = "#1f2933", "#66727f", "#bcc4cd", "#e4e7eb"
-# Okabe and Ito's palette, which people with colour blindness can tell apart.
-BLUE, VERMILION, GREEN, PURPLE, AMBER = "#0072b2", "#d55e00", "#009e73", "#b05c92", "#e69f00"
+from heliograph.simulation.results.plots import COLOURS
+
+INK, PALE, GRID = "#1f2933", "#bcc4cd", "#e4e7eb"
+BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED = COLOURS
 WIDTH = 5.4  # inches: 10 points are still 9 pixels high in a window of 420
 STYLE: Any = {  # of matplotlib's rcParams
     "font.family": "DejaVu Sans",
@@ -34,6 +35,12 @@ STYLE: Any = {  # of matplotlib's rcParams
     "lines.solid_capstyle": "round",
     "svg.hashsalt": "heliograph",  # the same drawing gives the same file
 }
+
+
+def stacked_panels(count: int, height: float, margin: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
+    """Return a figure with `count` panels of this height in inches one below the other, and a margin for its words."""
+    figure = Figure(figsize=(WIDTH, margin + height * count), layout="constrained")
+    return figure, list(figure.subplots(count, 1, squeeze=False, sharex=sharex)[:, 0])
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:

@@ -14,7 +14,17 @@ from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.losses.losses import Losses
 from heliograph.learning.solution import Row
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH, legend_above
+from heliograph.report.figures import (
+    AMBER,
+    BLUE,
+    GREEN,
+    MUTED,
+    PALE,
+    STYLE,
+    VERMILION,
+    legend_above,
+    stacked_panels,
+)
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 MOST = 40  # numbers, filters and nodes that are drawn; tables hold all
@@ -60,8 +70,7 @@ def _estimates(learned: Learned) -> Figure:
     rows = learned.fit.rows()[:MOST]
     forms = [solution.form for solution in learned.fit.solutions]
     by_form = {form: learned.fit.rows(form=form) for form in forms}
-    figure = Figure(figsize=(WIDTH, 0.6 + 0.62 * len(rows)), layout="constrained")
-    grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    figure, grid = stacked_panels(len(rows), 0.62, 0.6, sharex=False)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         # The form that counts is on top; a cross marks a number that the data do not determine.
         for j, form in enumerate(reversed(forms)):
@@ -81,8 +90,7 @@ def _estimates(learned: Learned) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _correlations(tested: list[Change]) -> Figure:
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.6 * len(tested)), layout="constrained")
-    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = stacked_panels(len(tested), 1.6, 0.7)
     # Correlation of innovations by lag, before and after, with 95 % intervals.
     for axes, change in zip(grid, tested, strict=True):
         for shift, color, e, label in ((-0.17, AMBER, change.before, "before"), (0.17, BLUE, change.after, "after")):
@@ -103,13 +111,14 @@ def _correlations(tested: list[Change]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _pits(received: list[Uniformity]) -> Figure:
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.5 * len(received)), layout="constrained")
-    grid = figure.subplots(len(received), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = stacked_panels(len(received), 1.5, 0.7)
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
         count = len(values)
         low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
-        axes.hist(values, np.linspace(0, 1, BINS + 1), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
+        axes.hist(
+            values, np.linspace(0, 1, BINS + 1).tolist(), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8
+        )
         axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
         axes.set_title(in_figure(transforms.node))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, stacked_panels
 from heliograph.report.health import FilterHealth, Health
 from heliograph.report.outputs import rounded
 from heliograph.report.page import Choice, Picture, Section, Table, Text
@@ -37,8 +37,7 @@ def tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
 @matplotlib.rc_context(LOOK)
 def innovations_figure(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
-    figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
-    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = stacked_panels(len(tested), 1.5, 0.6)
     names = _components(health)
     for axes, judged in zip(grid, tested, strict=True):
         white = np.asarray(judged.white)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above
+from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
     BAND,
@@ -62,9 +62,8 @@ def _ordered(record: Record) -> list[str]:
 
 @matplotlib.rc_context(LOOK)
 def _estimates(health: Health, record: Record, node: str) -> Figure:
-    figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(record.states)), layout="constrained")
-    grid = figure.subplots(len(record.states), 1, squeeze=False, sharex=True)[:, 0]
-    record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=list(grid), sigmas=BAND)
+    figure, grid = stacked_panels(len(record.states), 1.7, 0.8)
+    record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=grid, sigmas=BAND)
     legend_above(figure, grid[0])
     time_axis(health.record, grid[-1])
     return figure

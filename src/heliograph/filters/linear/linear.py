@@ -26,7 +26,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -36,6 +36,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import is_bounded
+
+Move = tuple[jax.Array, jax.Array, jax.Array]  # A (n, n), b (n,) and Cov w (n, n) of a step x+ = A x + b + w
 
 
 class LinearBelief(NamedTuple):
@@ -79,17 +81,13 @@ class LinearFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> LinearBelief:
         """Return the prior, both as estimate and as the state's moments before data."""
-        start = at(self.plant, 0)
-        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-        return LinearBelief(mean, spread, mean, spread)
+        return prior_belief(at(self.plant, 0))
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        transition, shift, noise = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
-        error, state_moments = (moved(*pair, transition, shift, noise) for pair in (state[:2], state[2:]))
-        return LinearBelief(*error, *within_range(*state_moments))
+        return predicted(state, (plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
@@ -122,6 +120,18 @@ class LinearFilter(AbstractSizedFilter):
         return plan(self, inputs)
 
 
+def prior_belief(start: AbstractPlant) -> LinearBelief:
+    """Return the prior, both as estimate and as the state's moments before data."""
+    mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+    return LinearBelief(mean, spread, mean, spread)
+
+
+def predicted(belief: LinearBelief, move: Move) -> LinearBelief:
+    """Both pairs of moments after x+ = A x + b + w, with the move (A, b, Cov w)."""
+    error, state = moved(*belief[:2], *move), moved(*belief[2:], *move)
+    return LinearBelief(*error, *_within_range(*state))
+
+
 @runs_last
 def moved(
     mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
@@ -130,7 +140,7 @@ def moved(
     return times_vector(matrix, mean) + shift, above_products(congruence(matrix, spread), matrix, spread) + noise
 
 
-def within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Moments that stay finite numbers: those before any data of an unstable plant, which only its inputs hold, do not.
 
     Behind a known gain nothing depends on them.

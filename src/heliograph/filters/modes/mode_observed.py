@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.linear import LinearBelief, corrected_linear, moved, within_range
+from heliograph.filters.linear.linear import LinearBelief, Move, corrected_linear, predicted, prior_belief
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
@@ -28,8 +28,6 @@ from heliograph.random_affine.combine import Mixture
 from heliograph.random_affine.modes import degree_in
 from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, nominal_spread
 
-Moved = tuple[jax.Array, jax.Array, jax.Array]
-
 
 class ModeObservedBelief(NamedTuple):
     """Posterior, the prior of the last correction, the measurement used then, and the plant's motion since.
@@ -40,7 +38,7 @@ class ModeObservedBelief(NamedTuple):
     belief: LinearBelief
     before: LinearBelief
     z: Float[jax.Array, " m"]
-    move: Moved
+    move: Move
     begun: Bool[jax.Array, ""]
 
     @property
@@ -67,11 +65,9 @@ class ModeObservedFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> ModeObservedBelief:
         """Return the belief before any data."""
-        start = at(self.plant, 0)
-        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
-        belief = LinearBelief(mean, spread, mean, spread)
+        belief = prior_belief(at(self.plant, 0))
         nothing = jnp.full(first(self.channel).outputs, jnp.nan)
-        still = jnp.eye(len(mean)), jnp.zeros(len(mean)), jnp.zeros_like(spread)
+        still = jnp.eye(len(belief.mean)), jnp.zeros(len(belief.mean)), jnp.zeros_like(belief.covariance)
         return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
 
     @predicts
@@ -79,7 +75,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         """Predict both pairs of moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         move = plant.transition_matrix(u), plant.shift(u), jnp.asarray(plant.noise_covariance(u))
-        return state._replace(belief=_over(state.belief, move), move=move)
+        return state._replace(belief=predicted(state.belief, move), move=move)
 
     @corrects
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
@@ -95,7 +91,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
             then = _given(at(self.channel, last), certain)
             redone, _ = corrected_linear(state.before, at(self.sensor, last), then, rule, state.z, size)
-            redone = _over(redone, state.move)
+            redone = predicted(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
             then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
             described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
@@ -117,13 +113,6 @@ class ModeObservedFilter(AbstractSizedFilter):
     def estimate(self, state: ModeObservedBelief) -> Estimate:
         """Mean and covariance of the estimate."""
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)
-
-
-def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
-    matrix, shift, noise = move
-    pairs = ((belief.mean, belief.covariance), (belief.state_mean, belief.state_covariance))
-    error, state = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
-    return LinearBelief(*error, *within_range(*state))
 
 
 def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
