@@ -372,13 +372,14 @@ def test_a_random_gain_of_noise_that_outputs_share_leaves_a_tenth():
 def test_outputs_that_say_the_same_of_a_tied_state_say_it_once():
     """A state of large noise tied to one that two outputs without noise see: the second corrects by no rounding.
 
-    The gain of the tied state is that of its noises' ratio; 1e-9 of it is what three outputs' rounding leaves.
+    Gains of 300 such pairs on the tied state, as the seen one moves it: the ratio of the noises, to rounding of 1e-6.
     """
-    noise = np.outer([-6.1284284702780554e6, 1621.5163399936262], [-6.1284284702780554e6, 1621.5163399936262])
-    plant = hg.LinearPlant([[-0.8, 2324.0], [1.2e-4, 0.8]], noise, [-7.5e7, 4.6e4], np.zeros((2, 2)))
-    matrix = np.array([[0.0, 1.1237265908030364e-4], [0.0, 4.1445155171850436e-4], [0.0, 2.1292054756944656e-4]])
-    item = hg.kalman_filter(plant, hg.LinearSensor(matrix, np.zeros((3, 3))))
-    prior = item.predict(item.init())
-    state = prior.mean + 1.3 * np.array([-6.1284284702780554e6, 1621.5163399936262])
-    mean = item.correct(prior, matrix @ state)[0].mean
-    assert np.max(np.abs(mean - state) / np.abs(state)) < 1e-9
+    rng = np.random.default_rng(0)
+    ties, seen = 10.0 ** rng.uniform(-4, 4, size=(2, 300)), 10.0 ** rng.uniform(-4, 4, size=(2, 300))
+    prior, output = ties[:, None] * ties[None], np.stack([np.zeros((2, 300)), seen], axis=1)
+    with jax.enable_x64(True):
+        gain, _ = precise_update(
+            *map(jnp.asarray, (prior, output, np.zeros_like(prior), (1e-14 * seen * ties[1]) ** 2))
+        )
+    moved = np.max(np.abs(np.asarray(gain) * seen), axis=1)
+    assert np.max(np.abs(moved / (ties / ties[1]) - 1)) < 1e-6
