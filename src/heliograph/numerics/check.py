@@ -133,7 +133,7 @@ def unmasked(value: Any) -> Any:
     """Return the numbers of a masked array, NaN where they are masked; anything else as it is."""
     if not isinstance(value, np.ma.MaskedArray) or value.dtype.kind not in "fiub":
         return value
-    return value.astype(np.float64).filled(np.nan)
+    return np.where(np.ma.getmaskarray(value), np.nan, np.asarray(value, dtype=np.float64))
 
 
 def _numbers(name: str, value: ArrayLike) -> Any:
