@@ -24,7 +24,8 @@ IN_A_HURRY = (
 
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
-MOST, GROWTH = 1.2e9, 0.2e9  # bytes of a process before it lets go, and since it last did
+MOST, GROWTH = 1.2e9, 0.2e9  # bytes of a process before it lets go after a file, and since it last did
+WITHIN = 1.8e9  # before it lets go between two tests of a file, which share programs
 
 
 def pytest_configure(config):
@@ -88,11 +89,23 @@ def memory_left():
     return [resident()]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def bounded_memory(memory_left):
     """Compiled programs are let go of when they, and what the compiler left, are a gigabyte: it takes time."""
     yield
-    if resident() > max(MOST, memory_left[-1] + GROWTH):
+    bound_memory(memory_left, MOST)
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory_of_file(memory_left):
+    """So are they in the middle of a file when there is no more memory: its other tests compile them again."""
+    yield
+    bound_memory(memory_left, WITHIN)
+
+
+def bound_memory(memory_left, most):
+    """Let go of all compiled programs if the process has more than so many bytes, and more than it last had left."""
+    if resident() > max(most, memory_left[-1] + GROWTH):
         forget()
         memory_left.append(resident())
 

@@ -16,6 +16,7 @@ from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compiled
 
 ROWS = 64  # what is compiled serves every number of rows up to the next multiple of it, and rows cost next to nothing
+ROWS_OF_EACH = 16  # of thousands of filters side by side they do cost
 
 
 class Followed(NamedTuple):
@@ -65,7 +66,7 @@ def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:
     parts, order = [], np.concatenate([*groups.values()])
     for members in groups.values():
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in members])
-        data, inputs = _padded(rows[members], np.zeros((*rows[members].shape[:2], 0)))
+        data, inputs = _padded(rows[members], np.zeros((*rows[members].shape[:2], 0)), ROWS_OF_EACH)
         parts.append(_cut(_followed(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[np.argsort(order)], *parts)
 
@@ -78,9 +79,9 @@ def apart(estimates, reference):
     return np.max(np.abs(mean - other) / deviation), np.max(of_covariance)
 
 
-def _padded(z: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _padded(z: np.ndarray, u: np.ndarray, multiple: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
     """Rows in which nothing arrives after the others."""
-    more = -z.shape[-2] % ROWS
+    more = -z.shape[-2] % multiple
     width = [(0, 0)] * (z.ndim - 2) + [(0, more), (0, 0)]
     return np.pad(z, width, constant_values=np.nan), np.pad(u, width)
 

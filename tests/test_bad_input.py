@@ -57,6 +57,9 @@ def one_per_step(*lengths: int) -> h.model.OverTime:
 
 SHAPES = [
     (lambda: h.LinearPlant(np.eye(3), EYE, [0, 0], EYE), "plant matrix", "shape (3, 3)"),
+    (lambda: h.LinearPlant([[1, 10**400], [0, 1]], EYE, [0, 0], EYE), "plant matrix", "[[1, 1000"),
+    (lambda: h.LinearPlant(np.array([["2026"]], "M8[Y]"), 1.0, [0], 1.0), "plant matrix", "array([['2026"),
+    (lambda: h.LinearPlant(np.ma.array(EYE, mask=EYE), EYE, [0, 0], EYE), "plant matrix", "2 that are not finite"),
     (lambda: h.LinearPlant([[1, 0], [1]], EYE, [0, 0], EYE), "plant matrix", "[[1, 0], [1]]"),
     (lambda: h.LinearPlant(EYE, np.eye(3), [0, 0], EYE), "process noise", "shape (3, 3)"),
     (lambda: h.LinearPlant(EYE, h.Gaussian(np.eye(3)), [0, 0], EYE), "process noise", "dimension 3"),
@@ -181,6 +184,9 @@ RUNS = [
     (lambda: h.run(network(), {"a": [1.0], "b": [1.0]}), "measurements", "['b']"),
     (lambda: h.run(network(), {"a": []}), "measurements", "none"),
     (lambda: h.run(network(), {"a": np.zeros((3, 2))}), "measurements of node 'a'", "shape (3, 2)"),
+    (lambda: h.run(network(), {"a": None}), "measurements of node 'a'", "shape ()"),
+    (lambda: h.run(network(), {"a": "abc"}), "measurements of node 'a'", "'abc'"),
+    (lambda: h.run(network(), {"a": [[10**400]]}), "measurements of node 'a'", "[[1000"),
     (lambda: h.run(network(), {"a": [1.0, INF]}), "measurements of node 'a'", "1 that are not finite"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0, 0.5]), "time", "0.5 after 1"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0]), "time", "shape (1,)"),
@@ -205,6 +211,18 @@ def test_one_line_that_names_it(make, name, came):
     assert "\n" not in message
     assert message.startswith(f"{name}: expected ")
     assert came in "got " + message.split(", got ", 1)[1]
+
+
+def test_masked_numbers_did_not_arrive():
+    """Estimates without the masked value, from an array, a column of a table and a sample of a stream: 0 apart."""
+    values = np.ma.array([1.0, 1e3, 2.0], mask=[False, True, False])
+    expected = h.run(network(), {"a": [1.0, NAN, 2.0]}).estimates["a"]["aware"].mean
+    table = h.files.read_recording({"time": [0.0, 1.0, 2.0], "y0": values}, network())
+    stream = h.Stream(node().filters["aware"])
+    pushed_means = [stream.push(values[k : k + 1]).mean for k in range(3)]
+    for means in (h.run(network(), {"a": values}).estimates["a"]["aware"].mean, pushed_means):
+        np.testing.assert_array_equal(means, expected)
+    np.testing.assert_array_equal(h.run(network(), *table).estimates["a"]["aware"].mean, expected)
 
 
 def test_a_covariance_that_is_lost_is_flagged_and_stays():

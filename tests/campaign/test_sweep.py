@@ -4,8 +4,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign.failures import Failure
-from heliograph.campaign.figures import NEES, RMSE, against, by_setting, campaign_figures
-from heliograph.campaign.page import campaign_page
+from heliograph.campaign.page import NEES, RMSE, against, by_setting, campaign_figures, campaign_page
 from heliograph.campaign.summary import read_summary
 from heliograph.report.progress import Countdown, spoken
 from tests.campaign.example import CAMPAIGN, write

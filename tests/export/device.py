@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliograph.export.c_files import export_c
-from heliograph.export.measure import COMPILER, FLAGS
+from heliograph.export.c_files import COMPILER, FLAGS, export_c
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(COMPILER) is None, reason=f"no C compiler: the command {COMPILER!r} is not there"

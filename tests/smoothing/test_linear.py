@@ -65,6 +65,7 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
         known = smoothing.estimates(steps)
         means = hg.simulation.over_runs(planned.means, np.stack([z, 2 * z]))
         np.testing.assert_allclose(means[0], known.mean, atol=CLOSE, rtol=0)
+        np.testing.assert_allclose(planned.means(z), known.mean, atol=CLOSE, rtol=0)
         np.testing.assert_allclose(planned.estimate.covariance, known.covariance, atol=CLOSE, rtol=0)
         assert planned.estimate.claim == "exact"
     with pytest.raises(ValueError, match=r"filter: expected one whose gains depend on no data, got OpenLoop"):
@@ -89,7 +90,7 @@ def test_simulations_of_nine_states_smooth_as_planned():
 def test_what_a_precise_future_leaves_keeps_its_digits():
     """Smoothed variances of a start that two precise positions pin down, against the limit R -> 0 of a straight line.
 
-    With Q = 0 all is simulated from z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2) / (T^2 + T).
+    With Q = 0 all is found from z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2) / (T^2 + T).
     P - P Lambda P is 1e-16 P wrong: more than the whole of the variance of v after the first step.
     """
     precise, steps = 1e-6, 6

@@ -1,21 +1,32 @@
-"""Report of a campaign: one self-contained page."""
+"""Report of a campaign: one self-contained page, and its figures, scores with intervals against each parameter."""
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from heliograph.campaign.failures import FAILURES, Failure, read_failures
-from heliograph.campaign.figures import PANELS, campaign_figures
-from heliograph.campaign.plan import BITWISE, Campaign
+from heliograph.campaign.plan import BITWISE, Campaign, Setting, canonical
+from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
-from heliograph.disk.quoting import visible
-from heliograph.report.figures import svg
+from heliograph.disk.quoting import in_figure, visible
+from heliograph.report.figures import INK, STYLE, WIDTH, svg
 from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
+from heliograph.simulation.results.plots import COLOURS
 
 REPORT = "report.html"
 ROWS = 200  # of the table on the page
 REPORTED = 20  # failures on the page
+PANELS, SETTINGS, PARAMETERS = 6, 20, 3  # more than that is in the table
+TITLE = 26  # characters in a line above a panel
+LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 
 
 def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
@@ -108,3 +119,156 @@ def _reading(campaign: Campaign) -> Section:
     ]
     text = f"The errors of every run are in the store; axes: {', '.join(['setting', 'run', 'time', 'node', 'filter'])}."
     return Section("All runs", [Text([text]), Code("\n".join(lines))])
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of scores, with the column of its standard error."""
+
+    label: str
+    value: str
+    error: str
+
+
+RMSE = Quantity("RMSE", "rmse", "rmse_error")
+NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
+
+
+def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
+    """Return figures by name: RMSE and NEES for each numeric parameter, or else by setting."""
+    parameters = [name for name in campaign.parameters if _is_axis(campaign, name)][:PARAMETERS]
+    figures = {}
+    for quantity in (RMSE, NEES):
+        for name in parameters:
+            figures[f"{quantity.value} against {name}"] = against(campaign, scores, name, quantity)
+        if not parameters:
+            figures[f"{quantity.value} by setting"] = by_setting(campaign, scores, quantity)
+    return figures
+
+
+def _is_axis(campaign: Campaign, name: str) -> bool:
+    """Return whether a parameter is a number that takes several values while all others are constant."""
+    values = parameter_values(campaign, name)
+    if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
+        return False
+    rests = [canonical(_rest(setting, name)) for setting in campaign.settings]
+    return len(set(rests)) < len(rests)
+
+
+def _rest(setting: Setting, name: str) -> Setting:
+    return {key: value for key, value in setting.items() if key != name}
+
+
+@matplotlib.rc_context(STYLE)
+def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
+    """Plot a quantity against a parameter, a curve for each filter with error bars of two standard errors.
+
+    There is one panel for each node and each choice of the other parameters.
+    """
+    values = parameter_values(campaign, parameter)
+    # Panels: scores with equal node and equal other parameters.
+    panels: dict[str, list[Score]] = {}
+    for score in scores:
+        rest = _rest(campaign.settings[score.setting], parameter)
+        title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
+        panels.setdefault(title, []).append(score)
+    shown = dict(list(panels.items())[:PANELS])
+    figure, grid = _panels(len(shown), 2.5)
+    colours = _colours(scores)
+    # A curve for each filter, in order of the parameter, with +- 2 standard errors.
+    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
+        for name in dict.fromkeys(score.filter for score in of_panel):
+            curve = [score for score in of_panel if score.filter == name]
+            curve.sort(key=lambda score: float(values[score.setting]))
+            x = [values[score.setting] for score in curve]
+            y, error = _columns(curve, quantity)
+            label = in_figure(name)
+            axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
+        axes.set_title(fill(in_figure(title), TITLE))
+    drawn = [score for of_panel in shown.values() for score in of_panel]
+    _scale(grid[0], [values[score.setting] for score in drawn], "x")
+    figure.supxlabel(in_figure(parameter), fontsize=10, color=INK)
+    _finish(figure, grid, drawn, quantity, colours)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
+    """Plot a quantity by setting, a point for each filter with two standard errors; one panel for each node."""
+    nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
+    settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
+    figure, grid = _panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
+    colours = _colours(scores)
+    # Rows are settings; the filters of a row are shifted so that error bars do not overlap.
+    for axes, node in zip(grid, nodes, strict=False):
+        for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
+            curve = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
+            y, error = _columns(curve, quantity)
+            rows = [settings.index(score.setting) + shift for score in curve]
+            axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
+        axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
+        axes.set_ylim(len(settings) - 0.5, -0.5)
+        axes.set_title(in_figure(node))
+        if quantity is NEES:
+            axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    # One scale for all panels, and one legend.
+    drawn = [score for score in scores if score.node in nodes and score.setting in settings]
+    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
+    grid[-1].set_xlabel(quantity.label)
+    _legend(figure, grid, colours)
+    return figure
+
+
+def _named(campaign: Campaign, setting: int) -> str:
+    text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
+    return in_figure(text if len(text) <= 36 else text[:35] + "…")
+
+
+def _panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
+    columns = min(columns, max(count, 1))
+    rows = -(-max(count, 1) // columns)
+    figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, grid
+
+
+def _colours(scores: Sequence[Score]) -> dict[str, str]:
+    names = dict.fromkeys(score.filter for score in scores)
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+
+
+def _columns(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
+    values = np.array([getattr(score, quantity.value) for score in scores])
+    return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
+
+
+def _finish(
+    figure: Figure, grid: list[Axes], drawn: Sequence[Score], quantity: Quantity, colours: Mapping[str, str]
+) -> None:
+    if quantity is NEES:
+        for axes in grid:
+            axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
+    figure.supylabel(quantity.label, fontsize=10, color=INK)
+    _legend(figure, grid, colours)
+
+
+def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
+    """Make a shared axis logarithmic if its values span a large ratio."""
+    finite = np.array([value for value in values if np.isfinite(value)])
+    if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():
+        axes.set_xscale("log") if axis == "x" else axes.set_yscale("log")
+
+
+def _legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
+    entries = {name: handle for axes in grid for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    names = [name for name in map(in_figure, colours) if name in entries]
+    figure.legend(
+        [entries[name] for name in names],
+        names,
+        loc="outside upper center",
+        ncols=min(len(names), 4) or 1,
+        frameon=False,
+    )

@@ -8,8 +8,7 @@ from cyclopts import Parameter
 from heliograph.cli.app import path_option
 
 if TYPE_CHECKING:
-    from heliograph.export.c_files import Exported
-    from heliograph.export.measure import Cost
+    from heliograph.export.c_files import Cost, Exported
     from heliograph.simulation.network import Network
 
 
@@ -33,8 +32,7 @@ def export(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.disk.quoting import visible
-    from heliograph.export.c_files import PRECISIONS, check_place, export_named
-    from heliograph.export.measure import cost
+    from heliograph.export.c_files import PRECISIONS, check_place, cost, export_named
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
 
@@ -78,7 +76,7 @@ KINDS = {
 
 def costs(written: "Exported", measured: "Cost") -> list[str]:
     """Describe the cost of a step in two lines."""
-    from heliograph.export.measure import COMPILER
+    from heliograph.export.c_files import COMPILER
 
     counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}
     counts["others"] = sum(written.operations.values()) - sum(counts.values())

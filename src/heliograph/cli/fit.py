@@ -80,7 +80,7 @@ def learn(
 
     from heliograph.files.fitted import NetworkAgain
     from heliograph.learning.held_out import changes, uniformity
-    from heliograph.learning.losses.losses import learn_losses_of
+    from heliograph.learning.losses.losses import learn_losses
     from heliograph.learning.losses.stretches import fates_of_measurements
     from heliograph.learning.senders import decides
     from heliograph.numerics.check import fail
@@ -103,7 +103,7 @@ def learn(
     uniform = uniformity(fitted.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
     advance("looking at losses")
     fates = fates_of_measurements(recording.measurements)
-    losses = learn_losses_of({name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])})
+    losses = {name: learn_losses(fate) for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])}
     return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
 
 

@@ -92,7 +92,7 @@ def computed(function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arg
         choice = chosen(function, arguments, [False] * len(arguments))
         if choice.code is None:
             return to_numpy(by_xla(*arguments))
-        return jax.tree.map(lambda leaf: leaf[0], choice.results())
+        return jax.tree.map(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
 
 
 def setting() -> str:

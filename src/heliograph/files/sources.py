@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from math import isfinite
 from operator import attrgetter
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -55,9 +55,6 @@ class Source:
     sequence: str | None
     plant: str | None
     step: float | None
-
-
-SourceTable: TypeAlias = Mapping[str, Source | Sequence[Source]]
 
 
 def json_field(

@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import check_output, format_of, whole_file
-from heliograph.numerics.check import InputError, fail, file_path, shown, table
+from heliograph.numerics.check import InputError, fail, file_path, shown, table, unmasked
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 from heliograph.numerics.types import Shaped
 
@@ -44,7 +44,7 @@ def _values(values: Any, name: str) -> np.ndarray:
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
-    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
+    column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(unmasked(values))
     if column.dtype.kind == "M":
         return np.asarray(column.astype("datetime64[ns]"))
     if column.dtype.kind in "fiub":

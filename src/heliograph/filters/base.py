@@ -16,7 +16,7 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrac
 from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.names import refuse_attribute
@@ -311,7 +311,7 @@ def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " 
     """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
     try:
-        numbers: Array = np.asarray(value)
+        numbers: Array = np.asarray(unmasked(value))
     except jax.errors.TracerArrayConversionError:
         numbers = jnp.asarray(value, dtype=float)
     except ValueError:  # rows of different lengths

@@ -1,7 +1,7 @@
 """Weights of estimates: best unbiased ones for a joint covariance, of all or of those that arrived; by levels."""
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import jax
@@ -99,10 +99,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
     """
-    nodes, n = joint.shape[:2]
-    component = jnp.einsum("iaja->aij", jnp.asarray(joint))
-    weights = jax.vmap(lambda block: matrix_weights(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
-    return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
+    return _by_component(matrix_weights, jnp.asarray(joint))
 
 
 @_of_joint
@@ -113,10 +110,22 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
     """
+    return _by_trace(matrix_weights, jnp.asarray(joint))
+
+
+def _by_component(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """Diagonal weights: those of each component of the state by itself."""
     nodes, n = joint.shape[:2]
-    traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
-    by_node = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
-    return jnp.einsum("i,ab->aib", by_node, jnp.eye(n))
+    component = jnp.stack([joint[:, a, :, a] for a in range(n)])
+    weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
+    return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
+
+
+def _by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """One number for each estimate: the weights of errors whose covariances are the traces."""
+    nodes, n = joint.shape[:2]
+    traces = jnp.einsum("iaja->ij", joint)
+    return jnp.einsum("i,ab->aib", weigh(traces.reshape(nodes, 1, nodes, 1))[0, :, 0], jnp.eye(n))
 
 
 def weighted(weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
@@ -244,12 +253,7 @@ def arrived_weights_by_component(
     degree, n = joint.shape[:2]
     if degree <= SHORT:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
-    component = jnp.stack([joint[:, a, :, a] for a in range(n)])
-
-    def single(block: jax.Array) -> jax.Array:
-        return arrived_weights(block.reshape(degree, 1, degree, 1), present)[0, :, 0]
-
-    return jnp.einsum("ai,ab->aib", jax.vmap(single)(component), jnp.eye(n))
+    return _by_component(partial(arrived_weights, present=present), joint)
 
 
 @runs_last
@@ -285,7 +289,4 @@ def arrived_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
     """One number for each of those that are present, of least trace."""
-    degree, n = joint.shape[:2]
-    traces = jnp.einsum("iaja->ij", joint)
-    single = arrived_weights(traces.reshape(degree, 1, degree, 1), present)[0, :, 0]
-    return jnp.einsum("i,ab->aib", single, jnp.eye(n))
+    return _by_trace(partial(arrived_weights, present=present), joint)

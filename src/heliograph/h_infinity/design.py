@@ -150,8 +150,8 @@ def horizon_design(
     steps, coordinates = scale(system, step_matrices(system, separate), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))  # as a correction of the given ones
     layouts = [Layout(n, m, len(s.growth), given_correction) for s in steps]
-    start = None if initial is None else coordinates.scaled_weight(_weight(initial, n), 0)
-    allowed = coordinates.unit**2 * coordinates.scaled_weight(system.initial_weight, 0)
+    start = None if initial is None else coordinates.initial_weight(_weight(initial, n))
+    allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
     # one convex problem in all weights, gains, multipliers and the level squared
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
@@ -203,8 +203,8 @@ class _Recursion:
         system, n, c = self.system, self.system.states, self.coordinates
         # P_0 in scaled coordinates, and the initial condition
         relative = (level / c.unit) ** 2
-        top = c.unit**2 * c.scaled_weight(system.initial_weight, 0)
-        present = (1 - MARGIN) * top if initial is None else c.scaled_weight(initial, 0) / relative
+        top = c.unit**2 * c.initial_weight(system.initial_weight)
+        present = (1 - MARGIN) * top if initial is None else c.initial_weight(initial) / relative
         design = _empty(system, self.separate, level, "")
         if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
             return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)

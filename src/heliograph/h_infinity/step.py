@@ -233,9 +233,9 @@ class Coordinates(NamedTuple):
         half = np.linalg.solve(self.states[k].T, scaled)
         return self.unit**2 * _symmetrised(np.linalg.solve(self.states[k].T, half.T))
 
-    def scaled_weight(self, weight: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
-        """Weight P_k in scaled coordinates."""
-        return _symmetrised(self.states[k].T @ weight @ self.states[k]) / self.unit**2
+    def initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+        """Weight P_0 in scaled coordinates."""
+        return _symmetrised(self.states[0].T @ weight @ self.states[0]) / self.unit**2
 
     def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
         """Gain of step k in the user's units."""

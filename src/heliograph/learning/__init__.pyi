@@ -18,7 +18,6 @@ from .losses.losses import (
     LossMemory as LossMemory,
     Losses as Losses,
     learn_losses as learn_losses,
-    learn_losses_of as learn_losses_of,
 )
 from .losses.shares import (
     Share as Share,

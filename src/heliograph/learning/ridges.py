@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from heliograph.learning.parameters import Parameters
 from heliograph.numerics.types import Float
@@ -32,7 +33,7 @@ class Confounded(NamedTuple):
 class Rank(NamedTuple):
     """Rank of the information at a point: directions of which nothing is known, and those of which something is.
 
-    Directions are orthonormal in units of each coordinate; weakest: least eigenvalue above zero, with its direction.
+    Directions are orthonormal in units of each coordinate; weakest: least eigenvalue above zero.
     Shapes: flat (p, k), rest (p, p - k), unit (p,).
     """
 
@@ -40,7 +41,6 @@ class Rank(NamedTuple):
     rest: Float[np.ndarray, "p r"]
     unit: Float[np.ndarray, " p"]
     weakest: float
-    weakest_direction: Float[np.ndarray, " p"]
 
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
@@ -50,9 +50,8 @@ def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
     unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
     none = values < NOTHING
-    least = int(np.argmax(~none)) if (~none).any() else 0
-    weakest = float(values[least]) if (~none).any() else np.inf
-    return Rank(vectors[:, none], vectors[:, ~none], unit, weakest, vectors[:, least])
+    weakest = float(values[~none].min(initial=np.inf))
+    return Rank(vectors[:, none], vectors[:, ~none], unit, weakest)
 
 
 def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]) -> list[Confounded]:
@@ -91,15 +90,9 @@ def _basis(vectors: np.ndarray) -> np.ndarray:
 def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     """Coordinates connected by flat directions at any point."""
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
-    left, results = [i for i in range(len(joined)) if joined[i, i]], []
-    while left:
-        group, edge = {left[0]}, {left[0]}
-        while edge:
-            edge = {int(j) for i in edge for j in np.flatnonzero(joined[i])} - group
-            group |= edge
-        results.append(tuple(sorted(int(i) for i in group)))
-        left = [i for i in left if i not in group]
-    return results
+    count, labels = connected_components(joined, directed=False)
+    groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
+    return [group for group in groups if joined[group, group].any()]
 
 
 def _in_words(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:

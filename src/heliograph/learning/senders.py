@@ -134,14 +134,21 @@ def filter_at(network: Network) -> AbstractFilter:
     return event_filter(network.plant, node.sensor, node.channel, node.trigger)
 
 
-def _highest(likelihood: Likelihood, start: Float[np.ndarray, " p"]) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """The maximum that is reached from a start."""
+def _highest(
+    likelihood: Likelihood, start: Float[np.ndarray, " p"], enough: float = np.inf
+) -> tuple[Float[np.ndarray, " p"], float, bool]:
+    """The maximum that is reached from a start, or the first point above `enough`."""
     if not len(start):
         return start, likelihood(start), True
     simplex = start + 0.2 * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     options: Any = {"initial_simplex": simplex, "xatol": DIGITS, "fatol": 1e-3, "maxfev": 200 * len(start)}
     climb: Any = minimize  # its types do not know an initial simplex
-    optimum = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options)
+
+    def stop(intermediate_result: Any) -> None:
+        if -intermediate_result.fun > enough:
+            raise StopIteration
+
+    optimum = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options, callback=stop)
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
@@ -150,9 +157,9 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
 
-    def profile(value: float) -> float:
-        rest = np.delete(x, coordinate)
-        return _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest)[1]
+    def near(value: float) -> bool:
+        rest, least = np.delete(x, coordinate), total - TWO_SIDED
+        return _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest, least)[1] > least
 
     def number(value: float) -> float:
         point = x.copy()
@@ -163,12 +170,12 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
     ends = []
     for sign in (-1.0, 1.0):
         inside, outside = 0.0, 0.05
-        while outside < FURTHEST and profile(x[coordinate] + sign * outside) > total - TWO_SIDED:
+        while outside < FURTHEST and near(x[coordinate] + sign * outside):
             inside, outside = outside, 2 * outside
         for _ in range(HALVINGS):
             middle = (inside + outside) / 2
-            near = profile(x[coordinate] + sign * middle) > total - TWO_SIDED
-            inside, outside = (middle, outside) if near else (inside, middle)
+            still = near(x[coordinate] + sign * middle)
+            inside, outside = (middle, outside) if still else (inside, middle)
             if outside - inside < 1e-3:
                 break
         ends.append(number(x[coordinate] + sign * outside))

@@ -95,7 +95,7 @@ def shown_error(error: Exception) -> str:
 
 
 def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
-    """Return `value` as a float64 array of the given shape; a traced one keeps its precision.
+    """Return `value` as a float64 array of the given shape, NaN where it is masked; a traced one keeps its precision.
 
     A length in the shape may be any: None, or a name by which an error calls it.
 
@@ -129,13 +129,20 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
     return f"shape ({lengths}){example}"
 
 
+def unmasked(value: Any) -> Any:
+    """Return the numbers of a masked array, NaN where they are masked; anything else as it is."""
+    if not isinstance(value, np.ma.MaskedArray) or value.dtype.kind not in "fiub":
+        return value
+    return np.where(np.ma.getmaskarray(value), np.nan, np.asarray(value, dtype=np.float64))
+
+
 def _numbers(name: str, value: ArrayLike) -> Any:
     try:
-        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(value)
-        if numbers.dtype.kind in "US":  # text is no number, though it may read as one
+        numbers = jnp.asarray(value) if is_traced(value) else np.asarray(unmasked(value))
+        if numbers.dtype.kind in "USmM":  # text and dates are no numbers, though they may read as such
             raise ValueError
         known = None if is_traced(value) else numbers.astype(np.float64 if numbers.dtype.kind != "c" else complex)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise fail(name, "an array of numbers", shown(value)) from None
     if np.issubdtype(numbers.dtype, np.complexfloating):
         raise fail(name, "real numbers", "complex ones")

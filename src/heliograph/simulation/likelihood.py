@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 
+from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Scalar
 
 
@@ -32,10 +34,14 @@ def log_likelihood(
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
     instance("filter", filter, AbstractFilter, "a filter")
-    total = _sum(filter, *data_of(filter, measurements, inputs))
-    return total if isinstance(total, jax.core.Tracer) else float(total)
+    arguments = filter, *data_of(filter, measurements, inputs)
+    if is_traced(arguments):
+        return _sum(*arguments)
+    return float(computed(_sum, _by_xla, arguments))
 
 
-@compiled
 def _sum(filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
     return jnp.sum(over_rows(filter, z, u, lambda state, innovation, k: jnp.asarray(innovation.log_likelihood)))
+
+
+_by_xla = compiled(_sum)

@@ -73,7 +73,7 @@ def run(
     name = next(iter(network.nodes))
     measured = table("measurements", measurements, f"arrays of nodes, such as {{{name!r}: z}},")
     network = network.restricted_to(measured)
-    steps = len(np.asarray(next(iter(measurements.values()))))
+    steps = len(np.atleast_1d(np.asarray(next(iter(measurements.values())), dtype=object)))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
     # Measurements, inputs and times of one length.

@@ -22,10 +22,10 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.centres.centre import (
     Centre,
+    CentreFilter,
     CentreState,
 )
 from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, fused_innovations
-from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
 from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
 from heliograph.simulation.centres.mesh import Mesh, meshes_of

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.backward_pass import planned_with_past, quiet_steps, stepped
@@ -81,11 +81,12 @@ class PlannedSmoother(Module):
     inputs: Float[Array, "horizon inputs"]
     estimate: Estimate
 
+    @in_float64
     def means(self, z: ArrayLike) -> Float[jax.Array, "time n"]:
-        """Smoothed means of one run's z (horizon, received), written for `hg.simulation.over_runs` and `jax.vmap`."""
-
+        """Smoothed means of one run's z (horizon, received), also for `hg.simulation.over_runs` and `jax.vmap`."""
+        z = array("measurements", z, (len(self.inputs), self.filter.received), missing=True)
         _, steps = stepped(self.filter, jnp.asarray(z), self.inputs, self.filter.init(), np.asarray(0))
-        return self.smoothing.means(steps)
+        return self.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
 def planned_smoother(

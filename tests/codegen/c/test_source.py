@@ -13,7 +13,7 @@ from heliograph.codegen.lowering import scalars
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
-from heliograph.export.measure import COMPILER, FLAGS
+from heliograph.export.c_files import COMPILER, FLAGS
 from tests.export.device import needs_compiler
 
 X = np.array([0.3, -1.7, 2.5, 0.9])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.numerics.float64 import compiled
 from heliograph.testing import check_filter
 from tests.follow import follow
 from tests.oracles.event_grid import Link, Scalar, forgetful, posterior
@@ -206,6 +207,12 @@ def test_what_does_not_fit_is_refused_in_one_line():
         assert "\n" not in str(error.value)
 
 
+@compiled
+def innovations(item, state, z):
+    """Of each value alone, from one state."""
+    return jax.vmap(lambda value: item.correct(state, value[None])[1])(z)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", ["zero", "prediction"])
 @pytest.mark.parametrize("link", [hg.perfect(), hg.hop(0.7, noise=0.05)], ids=["perfect", "hop"])
@@ -215,7 +222,7 @@ def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, r
     item = hg.event_filter(plant, SENSOR, link, hg.StochasticTrigger(2.0, reference))
     state = item.predict(item.init())
     z = np.linspace(-12.0, 12.0, 4001)
-    innovation = jax.vmap(lambda value: item.correct(state, value[None])[1])(z)
+    innovation = innovations(item, state, z)
     density = np.exp(np.asarray(innovation.log_likelihood, dtype=float))
     nothing = np.exp(float(item.correct(state, [np.nan])[1].log_likelihood))
     sent = np.trapezoid(density, z)

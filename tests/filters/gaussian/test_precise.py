@@ -367,3 +367,19 @@ def test_a_random_gain_of_noise_that_outputs_share_leaves_a_tenth():
     hop = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 0.0, dimension=2)
     steps = follow(hg.linear_filter(plant, sensor, hop), [[0.77, 0.28]])
     assert steps.covariance[0, 0, 0] >= 0.1 * 0.6966**2 * 2.94e-16
+
+
+def test_outputs_that_say_the_same_of_a_tied_state_say_it_once():
+    """A state of large noise tied to one that two outputs without noise see: the second corrects by no rounding.
+
+    Gains of 300 such pairs on the tied state, as the seen one moves it: the ratio of the noises, to rounding of 1e-6.
+    """
+    rng = np.random.default_rng(0)
+    ties, seen = 10.0 ** rng.uniform(-4, 4, size=(2, 300)), 10.0 ** rng.uniform(-4, 4, size=(2, 300))
+    prior, output = ties[:, None] * ties[None], np.stack([np.zeros((2, 300)), seen], axis=1)
+    with jax.enable_x64(True):
+        gain, _ = precise_update(
+            *map(jnp.asarray, (prior, output, np.zeros_like(prior), (1e-14 * seen * ties[1]) ** 2))
+        )
+    moved = np.max(np.abs(np.asarray(gain) * seen), axis=1)
+    assert np.max(np.abs(moved / (ties / ties[1]) - 1)) < 1e-6

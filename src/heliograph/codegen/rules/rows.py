@@ -57,10 +57,12 @@ def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tu
 
 
 def row_of(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
-    """Return the part of an argument that a row of the result needs."""
+    """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
+    if x.ndim < ndim:
+        return x
     if isinstance(x, InMemory):
-        return x.row(row)
-    return x[:1].reshape(x.shape[1:]) if x.ndim == ndim and ndim else x
+        return x.row(0 if x.shape[0] == 1 else row)
+    return x[:1].reshape(x.shape[1:])
 
 
 def like_row(equation: JaxprEqn, **params: Any) -> Any:

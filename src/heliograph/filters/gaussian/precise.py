@@ -73,7 +73,7 @@ def precise_update(
     unit = (n + 2) * float(np.finfo(start.dtype).eps)
     mean = jnp.broadcast_to(diagonal(unit * jnp.sqrt(jnp.maximum(diagonal_of(prior), 0.0))), (n, n, *runs))
     whole = jnp.broadcast_to(start, (n, n, *runs))
-    begin = _Taken(whole, jnp.abs(whole), mean, nothing, nothing)
+    begin = _Taken(whole, jnp.abs(whole), mean, mean, nothing, nothing)
     taken = jax.lax.scan(_use_component, begin, components)[0]
     gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise) + times(gain * rounded[None], transpose(gain))
@@ -117,20 +117,21 @@ def _lost(prior: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array
 class _Taken(NamedTuple):
     """State after some components: roots of P and of the mean's rounding, R (n, n), and two gains of T z (n, m).
 
-    doubt: rounding of the root of P, in eps (n, n); gain: of components of which more than rounding was unknown, which
-    P+ is made of; whole: of all.
+    doubt and blur: rounding of the two roots, in eps (n, n); gain: of components of which more than rounding was
+    unknown, which P+ is made of; whole: of all.
     """
 
     root: jax.Array
     doubt: jax.Array
     rounded: jax.Array
+    blur: jax.Array
     gain: jax.Array
     whole: jax.Array
 
 
 def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     """Roots and gains with one component more."""
-    before, doubt, rounded, gain, whole = state
+    before, doubt, rounded, blur, gain, whole = state
     f = times_vector(transpose(before), component.row)
     total = summed(f * f, 0) + component.variance
     # f is off by its reach, in eps; a component of which no more is left than that says nothing.
@@ -146,16 +147,20 @@ def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     news = component.number - times_vector(transpose(gain), component.row)
     # A component of which P leaves nothing unknown corrects the mean's rounding, by the root of that alone.
     g = times_vector(transpose(rounded), component.row)
-    reach = times_vector(transpose(jnp.abs(rounded)), component.size)
+    reach, blurred = (times_vector(transpose(a), component.size) for a in (jnp.abs(rounded), eps * LEFT * blur))
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
+    least = jnp.maximum(
+        least, summed(blurred * blurred, 0)
+    )  # two outputs that say the same leave the root's own rounding
     corrects = ~used & (size > least)
     step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size + component.noise, 1.0), column)
-    rounded = rounded - step[:, None] * g[None]
+    moved = step[:, None] * g[None]
+    rounded, blur = rounded - moved, blur + jnp.abs(moved)
     whole = whole + step[:, None] * (component.number - times_vector(transpose(whole), component.row))[None]
     # The root is off by the part of f that is: more than before where the components before left little of this one.
     less = shared[:, None] * turned[None]
     doubt = doubt + jnp.sqrt(off / safe) * jnp.abs(less)
-    return _Taken(before - less, doubt, rounded, gain + column[:, None] * news[None], whole), None
+    return _Taken(before - less, doubt, rounded, blur, gain + column[:, None] * news[None], whole), None
 
 
 class HasStart(Protocol):

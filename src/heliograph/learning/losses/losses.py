@@ -1,6 +1,5 @@
 """Losses learned from a recording: laws fitted, tests of their memory, drifting rates, the law that predicts best."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
 from heliograph.learning.losses.stretches import Fates, as_fates
-from heliograph.numerics.check import fail, scalar, table
+from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
@@ -108,19 +107,6 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
     lost = int(np.nansum(np.concatenate(parts)))
     return Losses(int(known.sum()), lost, _fitted(parts, True), loss_memory(parts), held_out_scores, best)
-
-
-def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict[str, Losses]:
-    """Learn the losses of each node or hop, by its name.
-
-    Args:
-        fates: {name: fates}, as `fates_by_node` and `fates_by_hop` give them.
-        held_out: share of the packets that choose, as in `learn_losses` (default 1/3).
-
-    Raises:
-        ValueError: as `learn_losses`.
-    """
-    return {name: learn_losses(stretches, held_out) for name, stretches in table("fates", fates, "fates").items()}
 
 
 def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:

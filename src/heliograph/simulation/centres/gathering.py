@@ -18,12 +18,12 @@ from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.centre import (
     Apart,
     Centre,
+    CentreFilter,
     Together,
     along_estimates,
     described,
     observation_model,
 )
-from heliograph.simulation.centres.fusion_centre import CentreFilter
 from heliograph.simulation.centres.linearised import LinearisedCentre
 from heliograph.simulation.centres.uplinks import Drawn, InFlight, Uplinks
 from heliograph.simulation.network import FUSED, Network
