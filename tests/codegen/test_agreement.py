@@ -17,6 +17,7 @@ RANDOM = np.random.default_rng(4)
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 0.5]], 0.3)
 TEN = hg.LinearPlant(np.diag([0.9] * 10) + np.diag([0.1] * 9, 1), 0.1 * np.eye(10), np.zeros(10), np.eye(10))
+FIRST = hg.LinearSensor(np.eye(1, 10), 0.3)
 TURNING = hg.Plant(lambda x, u: 0.8 * x + 0.3 * jnp.sin(jnp.roll(x, 1)), 0.1 * np.eye(2), np.ones(2), np.eye(2))
 BENT = hg.Sensor(lambda x: (x[0] + 0.2 * x[1] ** 2)[None], 0.1)
 RELAYS = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), 0.02), hg.hop(1.0, noise=0.01, amplification=1.2)])
@@ -32,6 +33,13 @@ FILTERS = {
     "imm": lambda: hg.filters.imm_filter(PLANT, SENSOR, FADING),
     "gpb2": lambda: hg.filters.gpb2_filter(PLANT, SENSOR, FADING),
     "polynomial": lambda: hg.polynomial_filter(PLANT, SENSOR, RELAYS, 30, 1),
+}
+LARGE = {
+    "kalman": lambda: hg.kalman_filter(TEN, FIRST),
+    "linear with memory": lambda: hg.linear_filter(TEN, FIRST, FADING),
+    "cubature": lambda: hg.cubature_filter(TEN, FIRST, UNCERTAIN),
+    "imm": lambda: hg.filters.imm_filter(TEN, FIRST, FADING),
+    "gpb1": lambda: hg.filters.gpb1_filter(TEN, FIRST, FADING),
 }
 
 
@@ -69,13 +77,14 @@ def test_every_filter_gives_what_xla_gives(name):
 
 
 @pytest.mark.slow
-def test_a_filter_of_more_states_than_xla_writes_out():
-    item = hg.kalman_filter(TEN, hg.LinearSensor(np.eye(1, 10), 0.3))
-    single, z = over_recording(item), measurements(item, 5, 30)
+@pytest.mark.parametrize("name", LARGE)
+def test_filters_of_more_states_than_xla_writes_out(name):
+    item = LARGE[name]()
+    single, z = over_recording(item), measurements(item, 5, 10)
     assert engine_of(single, z).startswith("native")
-    mean, covariance = compile(single, z[0])(z)
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
+    mean, covariance = compile(single, z[0])(z)
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
     assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
     assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
