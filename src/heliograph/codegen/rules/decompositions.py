@@ -1,5 +1,6 @@
 """Rules of small matrices' decompositions: symmetric ones by Jacobi rotations until diagonal, others as L U."""
 
+from collections.abc import Callable
 from functools import cache
 from itertools import combinations
 from typing import Any
@@ -38,7 +39,23 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         rest = [jnp.abs(state[0][pair]) > size for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(rest)) & (state[2] < SWEEPS)
 
-    # One turn: A <- J' A J, V <- V J for pairs (p, q) of all rows, then the next row in the place of each.
+    turns, turn = _tournament(n)
+
+    # One sweep: after so many turns each pair was rotated once, and each row is in its place again.
+    def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
+        rotated, _ = jax.lax.scan(turn, state[:2], length=turns)
+        return *rotated, state[2] + 1
+
+    if n > 1:
+        entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
+
+    values, columns = _sorted([entries[i, i] for i in range(n)], [[vectors[i, j] for i in range(n)] for j in range(n)])
+    rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
+    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values), jnp.nan)
+
+
+def _tournament(n: int) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
+    """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
     turns = n - 1 + n % 2
     pairs = [(k, turns - k) for k in range(1, turns // 2 + 1)] + [(0, n - 1)] * (1 - n % 2)
     moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]
@@ -50,26 +67,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
         entries = {(i, j): entries[min(moved[i], moved[j]), max(moved[i], moved[j])] for i, j in entries}
         return (entries, {(i, j): vectors[i, moved[j]] for i, j in vectors}), None
 
-    # One sweep: after so many turns each pair was rotated once, and each row is in its place again.
-    def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
-        rotated, _ = jax.lax.scan(turn, state[:2], length=turns)
-        return *rotated, state[2] + 1
-
-    if n > 1:
-        entries, vectors, _ = jax.lax.while_loop(goes_on, sweep, (entries, vectors, jnp.asarray(0)))
-
-    # Sort by odd-even transposition, which needs no branches.
-    def exchanges(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
-        values, columns = list(state[0]), list(state[1])
-        for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
-            _exchange(values, columns, i)
-        return (values, columns), None
-
-    values = [entries[i, i] for i in range(n)]
-    columns = [[vectors[i, j] for i in range(n)] for j in range(n)]
-    (values, columns), _ = jax.lax.scan(exchanges, (values, columns), length=(n + 1) // 2)
-    rows = jnp.stack([jnp.stack(column) for column in columns], axis=1)
-    return jnp.where(finite, rows, jnp.nan), jnp.where(finite, jnp.stack(values), jnp.nan)
+    return turns, turn
 
 
 def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
@@ -88,6 +86,20 @@ def _rotate(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
             a[first], a[second] = c * a[first] - s * a[second], s * a[first] + c * a[second]
         left, right = vectors[k, p], vectors[k, q]
         vectors[k, p], vectors[k, q] = c * left - s * right, s * left + c * right
+
+
+def _sorted(values: list[jax.Array], columns: list[list[jax.Array]]) -> tuple[list[jax.Array], list[list[jax.Array]]]:
+    """Sort by odd-even transposition, which needs no branches."""
+    n = len(values)
+
+    def exchanges(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
+        values, columns = list(state[0]), list(state[1])
+        for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
+            _exchange(values, columns, i)
+        return (values, columns), None
+
+    after, _ = jax.lax.scan(exchanges, (values, columns), length=(n + 1) // 2)
+    return after
 
 
 def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:

@@ -149,9 +149,8 @@ def _use_component(state: _Taken, component: Component) -> tuple[_Taken, None]:
     g = times_vector(transpose(rounded), component.row)
     reach, blurred = (times_vector(transpose(a), component.size) for a in (jnp.abs(rounded), eps * LEFT * blur))
     size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
-    least = jnp.maximum(
-        least, summed(blurred * blurred, 0)
-    )  # two outputs that say the same leave the root's own rounding
+    # Two outputs that say the same leave the root's rounding alone.
+    least = jnp.maximum(least, summed(blurred * blurred, 0))
     corrects = ~used & (size > least)
     step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size + component.noise, 1.0), column)
     moved = step[:, None] * g[None]
