@@ -18,7 +18,7 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
 SHORT = 24  # unknowns of equations that are solved side by side
-RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have on top of its own
+RIDGE = 1e-8  # of a variance: independent error that each estimate is taken to have besides
 
 
 Weights = Callable[..., Float[jax.Array, "n node n"]]
