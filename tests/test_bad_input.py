@@ -211,7 +211,7 @@ RUNS = [
     (lambda: h.monte_carlo(network(), np.timedelta64(1, "s"), 1, 0), "horizon", "timedelta64(1,'s')"),
     (
         lambda: h.Timeline(network(), 5.0).push("a", np.timedelta64(1, "s"), 0.0, [1.0]),
-        "sequence",
+        "event of 'a', sequence",
         "timedelta64(1,'s')",
     ),
     (lambda: node().filters["aware"].predict(None), "state", "None"),
