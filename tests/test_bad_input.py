@@ -46,6 +46,11 @@ def pushed() -> h.Network:
     return h.Network(driven(), {"a": h.Node(sensor(), h.perfect(), filters)})
 
 
+def small() -> tuple[h.LinearPlant, h.LinearSensor]:
+    """Parts of one state."""
+    return h.LinearPlant([[1.0]], 1.0, [0.0], 1.0), h.LinearSensor([[1.0]], 1.0)
+
+
 def lasting(steps: int) -> h.Network:
     channel = h.model.over_time([h.hop(0.5 + k, 0.1) for k in range(steps)])
     return h.Network(plant(), {"a": h.Node(sensor(), channel, {})})
@@ -198,6 +203,21 @@ RUNS = [
     (lambda: h.monte_carlo(network(), 1, 0, 0), "runs", "got 0"),
     (lambda: h.monte_carlo(network(), 1, 1, 0, inputs=np.zeros((1, 3))), "inputs", "shape (1, 3)"),
     (lambda: h.Stream(node().filters["aware"]).push([INF]), "measurement", "[inf]"),
+    (
+        lambda: h.monte_carlo(network(), 1, 1, np.timedelta64(1, "s")),
+        "key",
+        "timedelta64(1,'s')",
+    ),  # one of NumPy's integers
+    (lambda: h.monte_carlo(network(), np.timedelta64(1, "s"), 1, 0), "horizon", "timedelta64(1,'s')"),
+    (
+        lambda: h.Timeline(network(), 5.0).push("a", np.timedelta64(1, "s"), 0.0, [1.0]),
+        "event of 'a', sequence",
+        "timedelta64(1,'s')",
+    ),
+    (lambda: node().filters["aware"].predict(None), "state", "None"),
+    (lambda: node().filters["aware"].correct(None, [1.0]), "state", "None"),
+    (lambda: node().filters["aware"].step((), [1.0]), "state", "()"),
+    (lambda: node().filters["aware"].predict(h.kalman_filter(*small()).init()), "state", "Belief("),
 ]
 
 

@@ -272,15 +272,53 @@ def test_a_kernel_over_many_takes_what_they_share_from_memory_whole(length):
     np.testing.assert_allclose(result, x * row.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
-def test_numbers_read_as_others_of_fewer_bits_are_computed_by_xla():
-    """A double as two words, for a key, within each run and for many of them."""
+@pytest.mark.parametrize("length", [2, 300])
+def test_a_number_is_read_as_two_words(length):
+    """The low word first, as a key of random numbers takes them; of long arrays in a loop."""
 
     def words(x):
         return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
+    x = RANDOM.normal(size=(3, length))
+    assert engine_of(words, x).startswith("native")
+    np.testing.assert_array_equal(hg.simulation.over_runs(words, x), x.view(np.uint32).reshape(3, length, 2))
+
+
+def test_numbers_read_as_others_of_fewer_bits_are_computed_by_xla():
+    def short(x):
+        return jax.lax.bitcast_convert_type(x, jnp.int32)
+
     x = RANDOM.normal(size=(3, 2))
-    assert engine_of(words, x).startswith("xla: bitcast from f64 to u32")
-    np.testing.assert_array_equal(hg.simulation.over_runs(words, x), x.view(np.uint32).reshape(3, 2, 2))
+    assert engine_of(short, x).startswith("xla: bitcast from f64 to i32")
+    np.testing.assert_array_equal(hg.simulation.over_runs(short, x), x.view(np.int32).reshape(3, 2, 2))
+
+
+def test_numbers_may_be_multiplied_with_truth_values_and_integers():
+    """Sums of some components, as a plant or a sensor may write them; a product converts what it takes."""
+
+    def sums(x):
+        return x @ (x[:, None] > jnp.arange(2)), (x > 0) @ x, x.astype(int) @ jnp.outer(x, x)
+
+    x = RANDOM.normal(size=(5, 3))
+    assert engine_of(sums, x).startswith("native")
+    by_numpy = [(r @ (r[:, None] > np.arange(2)), (r > 0) @ r, r.astype(int) @ np.outer(r, r)) for r in x]
+    for values, expected in zip(hg.simulation.over_runs(sums, x), zip(*by_numpy, strict=True), strict=True):
+        np.testing.assert_allclose(values, expected, rtol=1e-14, atol=1e-15)  # fused or not: a rounding of 1
+
+
+def test_the_largest_and_least_of_many_integers_and_truth_values():
+    """A loop over a long array begins with what is neutral, which is no infinity there."""
+
+    def extremes(x):
+        whole = (100 * x).astype(int)
+        return jnp.max(whole), jnp.min(whole), jnp.max(x > 9), jnp.min(x > -9)
+
+    x = RANDOM.normal(size=(3, 300))
+    assert engine_of(extremes, x).startswith("native")
+    whole = (100 * x).astype(int)
+    expected = whole.max(axis=1), whole.min(axis=1), [False] * 3, [True] * 3
+    for values, by_numpy in zip(hg.simulation.over_runs(extremes, x), expected, strict=True):
+        np.testing.assert_array_equal(values, by_numpy)
 
 
 def test_numbers_are_found_in_a_table_as_jax_finds_them():

@@ -45,6 +45,7 @@ S = X @ X.T + np.eye(3)
         lambda x: (jnp.max(x), jnp.argmin(x, axis=1), jnp.cumsum(x, axis=0), jnp.any(x > 0, axis=0), x**3, x**-2),
         lambda x: (jnp.where(x > 0, x, jnp.nan), jnp.clip(x, -0.5, 0.5), jnp.arctan2(x, 2.0), jnp.maximum(x, jnp.nan)),
         lambda x: (jnp.einsum("ij,kj->ik", x, x), jax.lax.rsqrt(x * x), jnp.round(x * 0 + 2), jnp.tile(x, (2, 1))),
+        lambda x: (x @ (x[0] > 0), jnp.arange(3) @ x, (x > 0) @ jnp.arange(4)),
         lambda x: jax.lax.scan(lambda c, row: (c * 0.5 + row, c.sum()), jnp.zeros(4), x, reverse=True),
         lambda x: jax.lax.cond(x[0, 0] > 0, lambda: x[0], lambda: x[1]),
     ],

@@ -86,6 +86,7 @@ FILTERS = {
         LINE, RANGE, hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
     ),
     "late": lambda: hg.linear_filter(LINE, RANGE, hg.model.delayed(FADING, hg.Discrete([0, 1], [0.5, 0.5]))),
+    "late by one step, with a state called step": lambda: hg.linear_filter(LINE, RANGE, hg.model.delayed(FADING, 1)),
     "squares of what arrives": lambda: hg.polynomial_filter(
         hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1), TWO_GAINS, horizon=30, degree=2
     ),

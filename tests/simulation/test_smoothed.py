@@ -113,5 +113,8 @@ def test_what_cannot_be_smoothed_is_refused_in_one_line():
         hg.monte_carlo(network, 4, 2, 0, smooth=hg.smoothing.FixedInterval())
     with pytest.raises(ValueError, match=r"smooth: expected one such as .*, got 'interval'"):
         hg.monte_carlo(WHOLE, 4, 2, 0, smooth="interval")
+    nothing = hg.Network(PLANT, {"node": hg.Node(SENSOR, FADING, {})})
+    with pytest.raises(ValueError, match="smoothing: expected a filter at a node or the centre, got a network without"):
+        hg.monte_carlo(nothing, 4, 2, 0, smooth=hg.smoothing.FixedInterval())
     with pytest.raises(ValueError, match="step of a fixed point: expected one of the run's 4"):
         hg.monte_carlo(WHOLE, 4, 2, 0, smooth=hg.smoothing.FixedPoint(4))

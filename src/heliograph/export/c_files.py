@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from heliograph.codegen.c_source import Real
 from heliograph.disk.whole_file import check_output, whole_files
-from heliograph.export.program import step_program
+from heliograph.export.program import RESERVED, step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.factored import factored
@@ -24,11 +24,6 @@ COMPILER = "cc"
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Werror", "-O2")
 STEPS = 200_000
 REPEATS = 5
-RESERVED = frozenset((
-    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
-    "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
-    "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
-))  # fmt: skip
 
 
 class Exported(NamedTuple):

@@ -93,6 +93,12 @@ class DeviceLowering(Lowering):
 
 
 RANDOM = ("random_", "threefry")
+RESERVED = frozenset((
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
+    "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
+    "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+))  # fmt: skip
+ADDED = frozenset(("step", "estimate_mean", "estimate_covariance"))  # members beside the arrays of the filter's state
 
 
 class Leaf(NamedTuple):
@@ -230,7 +236,9 @@ def names_of(state: PyTree) -> list[str]:
         parts = (str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path)
         text = "_".join("".join(c if c.isalnum() and c.isascii() else "_" for c in p) for p in parts)
         text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
-        names.append(text if text not in names else f"{text}_{len(names)}")
+        while text in RESERVED | ADDED or text in names:
+            text += "_"
+        names.append(text)
     return names
 
 

@@ -98,10 +98,11 @@ class AbstractFilter(Module):
             The state and the estimate after the step.
 
         Raises:
-            ValueError: z, u or k of another size than the filter's; infinite values; an input that is NaN.
+            ValueError: a state of another form than the filter's; z, u or k of another size; infinite values; an input
+                that is NaN.
         """
         z, u = measured(self, z), given(self, u)
-        return _step(self, state, z, u, step_number(self, k))
+        return _with_state(self, state, _step, z, u, step_number(self, k))
 
     def run(self, z: Float[ArrayLike, "steps received"], u: Float[ArrayLike, "steps inputs"] | None = None) -> Filtered:
         """Run the filter over rows of data from its initial state: for each row predict, then correct.
@@ -128,7 +129,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses.
         """
         z, u = measured(self, z), given(self, u)
-        return step_with_judgement(self, state, z, u, step_number(self, k))[:3]
+        return _with_state(self, state, step_with_judgement, z, u, step_number(self, k))[:3]
 
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
@@ -139,7 +140,7 @@ class AbstractFilter(Module):
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
         z, u = measured(self, z), given(self, u)
-        return _step_with_smoother(self, state, z, u, step_number(self, k))
+        return _with_state(self, state, _step_with_smoother, z, u, step_number(self, k))
 
     def smoother_step(self, step: StepTrace) -> AbstractSmootherStep:
         """Return what the backward pass needs of a step, from the filter's states around it.
@@ -212,6 +213,21 @@ def sized(claim: Claim, like: HasStates, received: int) -> Sizes:
     return Sizes(claim=claim, states=like.states, inputs=like.inputs, received=received)
 
 
+def _with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R], *data: PyTree) -> R:
+    """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so."""
+    try:
+        return function(filter, state, *data)
+    except (AttributeError, IndexError, TypeError):
+        if _form(state) == _form(filter.init()):
+            raise
+        raise fail("state", "one of the filter's, as its init() returns", shown(state)) from None
+
+
+def _form(state: PyTree) -> PyTree:
+    """Structure of a state, and the shapes of its arrays."""
+    return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]
+
+
 @compiled
 def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     after, _ = filter.correct(filter.predict(state, u, k), z, k)
@@ -265,7 +281,7 @@ def _checked(
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
-        return run(filter, state, check(filter, data), step_number(filter, k))
+        return _with_state(filter, state, run, check(filter, data), step_number(filter, k))
 
     return cast(Callable[P, R], call)
 

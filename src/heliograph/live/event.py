@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, is_whole, shown
 from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
@@ -49,14 +49,14 @@ class Known(NamedTuple):
 
 def whole(name: str, value: object) -> int:
     """Check a count: an integer from 0 of 63 bits."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= int(value) < 2**63:
+    if not is_whole(value) or not 0 <= int(value) < 2**63:
         raise fail(name, WHOLE, shown(value))
     return int(value)
 
 
 def moment(name: str, value: object) -> float:
     """Check a time: a finite number, since times are counted from an origin."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+    if not is_whole(value) and not isinstance(value, float | np.floating):
         raise fail(name, "a finite number", shown(value))
     if not np.isfinite(value):
         raise fail(name, "a finite number", value)

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeGuard, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -245,9 +245,14 @@ def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
     return numbers
 
 
+def is_whole(value: object) -> TypeGuard[int | np.integer]:
+    """Return whether it is a whole number: an int or one of NumPy's, of which a span of time is none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+
+
 def check_count(name: str, value: object, least: int = 1) -> int:
     """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+    if not is_whole(value) or value < least:
         expected = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
         raise fail(name, expected, value if isinstance(value, int | float) else shown(value))
     if value > MOST:
@@ -257,7 +262,7 @@ def check_count(name: str, value: object, least: int = 1) -> int:
 
 def check_seed(name: str, value: object) -> int:
     """Return a whole number that 32 bits hold, as the keys of draws do."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST:
+    if not is_whole(value) or not 0 <= value <= MOST:
         raise fail(name, f"a whole number from 0 to {MOST}", shown(value))
     return int(value)
 

@@ -124,7 +124,7 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
     """Select the part of a network that is smoothed: all its estimates; where relays run schedules, the receiver's.
 
     Raises:
-        ValueError: a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
+        ValueError: no filter, a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
     """
     instance("smooth", smoothing, AbstractSmoothing, "one such as hg.smoothing.FixedInterval()")
     smoothing.check(horizon)
@@ -135,6 +135,8 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
     smoothed = network
     if network.relays is not None:
         smoothed = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
+    if not any(by_name for by_name in (*(node.filters for node in smoothed.nodes.values()), smoothed.fused)):
+        raise fail("smoothing", "a filter at a node or the centre", "a network without filters")
     # Claims of smoothed estimates and of their fusions.
     claims: Claims = {
         name: {f: _smoothed_claim(filter) for f, filter in node.filters.items()}

@@ -23,6 +23,31 @@ def test_the_filter_without_memory_claims_less_than_half_of_its_error():
     assert result.true[-1, 0, 0] == pytest.approx(0.276761, abs=6e-7)
 
 
+def test_a_filter_that_takes_signals_as_current_ignores_memory_too():
+    """Without any delay it is the filter without memory, and claims no more of itself."""
+    current = hg.filters.as_current_filter(PLANT, SENSOR, bursts())
+    assert current.claim == "nominal"
+    assert hg.filters.as_current_filter(PLANT, SENSOR, hg.hop(1.0, 0.1)).claim == "exact"
+
+
+@pytest.mark.parametrize("delay", [1, hg.Discrete([0, 1], [0.5, 0.5])])
+def test_behind_delays_that_remember_nothing_no_memory_is_missing(delay):
+    channel = hg.hop(1.0, 0.1, delay=delay)
+    blind, best = memoryless(PLANT, SENSOR, channel), hg.linear_filter(PLANT, SENSOR, channel)
+    assert blind.claim == "exact"
+    z = [[0.3], [0.1]]
+    np.testing.assert_array_equal(blind.run(z).covariances, best.run(z).covariances)  # the same computation
+
+
+def test_delays_that_last_are_taken_as_drawn_anew():
+    lasting = hg.hop(1.0, 0.1, delay=hg.random_affine.MarkovChain([[0.9, 0.1], [0.1, 0.9]]))
+    anew = hg.hop(1.0, 0.1, delay=hg.Discrete([0, 1], [0.5, 0.5]))
+    blind, best = memoryless(PLANT, SENSOR, lasting), hg.linear_filter(PLANT, SENSOR, anew)
+    assert (blind.claim, best.claim) == ("nominal", "exact")
+    z = [[0.3], [0.1], [0.4]]
+    np.testing.assert_allclose(blind.run(z).covariances, best.run(z).covariances, rtol=1e-12)  # the same law
+
+
 def test_two_hops_that_drift():
     plant = hg.LinearPlant([[0.98, 0.1], [0, 0.95]], np.diag([0.002, 0.02]), [1.0, 0.0], np.diag([1.0, 0.2]))
     sensor, channel = hg.LinearSensor([[1.0, 0.0]], 0.05), hg.amplify_and_forward(HOPS)

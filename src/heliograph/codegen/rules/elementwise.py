@@ -91,12 +91,18 @@ def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Read numbers as others of as many bits."""
-    (x,), type = inputs, result_type(equation)
-    kinds = {n.type for n in x.ravel().tolist()}
-    if x.shape != result_shape(equation) or any(kind[1:] != type[1:] for kind in kinds):
-        raise Unsupported(f"bitcast from {', '.join(sorted(kinds))} to {type}")
-    return [array_of([n if n.type == type else lowering.graph.node("bitcast", type, n) for n in x.ravel()], x.shape)]
+    """Read numbers as others of as many bits, or each as two words, the low one first."""
+    (x,), type, shape, node = inputs, result_type(equation), result_shape(equation), lowering.graph.node
+    numbers = x.ravel().tolist()
+    kinds = {n.type for n in numbers}
+    if shape == x.shape and all(kind[1:] == type[1:] for kind in kinds):
+        return [array_of([n if n.type == type else node("bitcast", type, n) for n in numbers], shape)]
+    if shape == (*x.shape, 2) and kinds <= {"f64", "u64"} and type == "u32":
+        bits = [n if n.type == "u64" else node("bitcast", "u64", n) for n in numbers]
+        half = lowering.graph.constant(32, "u64")
+        words = [node("convert", "u32", w) for b in bits for w in (b, node("shift_right", "u64", b, half))]
+        return [array_of(words, shape)]
+    raise Unsupported(f"bitcast from {', '.join(sorted(kinds))} to {type}")
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.graph import Graph
 from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
 from heliograph.codegen.nodes import Node, Type, Unsupported
@@ -23,9 +24,20 @@ def _reduction(op: str, empty: float) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(int(np.prod(shape, dtype=int)), -1)
-        return [array_of([total(lowering.graph, op, type, row, empty) for row in x.tolist()], shape)]
+        return [array_of([total(lowering.graph, op, type, row, _within(type, empty)) for row in x.tolist()], shape)]
 
     return rule
+
+
+def _within(type: Type, number: float) -> float:
+    """Return the number of this type that is nearest to one: infinity is no integer."""
+    if type == "f64" or np.isfinite(number):
+        return number
+    greatest = number > 0
+    if type == "bool":
+        return greatest
+    limits = np.iinfo(DTYPES[type])
+    return limits.max if greatest else limits.min
 
 
 def _cumulative(op: str) -> Rule:
@@ -70,8 +82,10 @@ def _arg(op: str) -> Rule:
 def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Sum products over the contracted axes, with batch axes first."""
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    a, b = (_batched(x, c, d) for x, c, d in ((inputs[0], left, left_batch), (inputs[1], right, right_batch)))
-    graph, type, inner = lowering.graph, result_type(equation), a.shape[2]
+    graph, type = lowering.graph, result_type(equation)
+    x, y = (_of_type(graph, type, x) for x in inputs)
+    a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
+    inner = a.shape[2]
     nodes = []
     for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
         for row in rows:
@@ -79,6 +93,11 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
                 products = [graph.node("mul", type, row[k], column[k]) for k in range(inner)]
                 nodes.append(total(graph, "add", type, products, 0.0 if type == "f64" else 0))
     return [array_of(nodes, result_shape(equation))]
+
+
+def _of_type(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
+    """Convert integers and truth values, with which numbers may be multiplied."""
+    return array_of((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
 
 
 def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:

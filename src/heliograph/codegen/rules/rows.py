@@ -35,14 +35,14 @@ def _are_known(inputs: list[Value]) -> bool:
 
 def _of_entries(name: str) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        shape = result_shape(equation)
+        shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
-        items = [x if len(x.shape) < len(shape) or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
+        items = [x if len(x.shape) < ndim or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
         row_equation = like_row(equation)
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            rows = [row_of(lowering, x, row, len(shape)) for x in items]
+            rows = [row_of(lowering, x, row, ndim) for x in items]
             return [], list(lowering.equation(row_equation, rows))
 
         return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])

@@ -244,7 +244,7 @@ def linear_filter(
 
 def memoryless_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter:
+) -> AbstractFilter:
     """Best linear filter for links with independent draws, behind links that may have memory.
 
     Args:
@@ -261,9 +261,16 @@ def memoryless_filter(
 
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
-    ignoring = linear_filter(plant, sensor, without_memory(channel), update)
-    assert isinstance(ignoring, LinearFilter)  # a channel without memory has no other
-    return replace(ignoring, claim="nominal") if memory_matters(channel) else ignoring
+    forgets, matters = without_memory(channel), memory_matters(channel)
+
+    def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
+        ignoring = linear_filter(plant, sensor, channel, update)
+        assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
+        return replace(ignoring, claim="nominal") if matters else ignoring
+
+    # Delays: the same filter for the system enlarged by past signals.
+    late = as_maps("channel", [first(forgets)])[0].past
+    return behind_delays(plant, sensor, forgets, make) if late else make(plant, sensor, forgets)
 
 
 def as_current_filter(
@@ -277,7 +284,8 @@ def as_current_filter(
         channel: from the sensor to the filter; its delays and memory are ignored.
         update: how uncertain probabilities are bounded; `Polytope()` by default.
 
-    Claim: "nominal" where anything can be late; `true_error` computes the error that results, before any data.
+    Claim: "nominal" where anything can be late or memory matters; `true_error` computes the error that results, before
+    any data.
 
     Raises:
         ValueError: what `linear_filter` refuses, losses.
@@ -286,4 +294,4 @@ def as_current_filter(
     """
     ignoring = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
     assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-    return replace(ignoring, claim="nominal") if first(channel).past else ignoring
+    return replace(ignoring, claim="nominal") if first(channel).past or memory_matters(channel) else ignoring

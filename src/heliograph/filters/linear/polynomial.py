@@ -50,6 +50,7 @@ class Centre(Module):
     received: Array | OverTime
 
 
+@in_float64
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
     """Return the mean of a linear model's state; None where it is zero throughout or a gain is random."""
     plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)

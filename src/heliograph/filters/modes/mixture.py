@@ -235,7 +235,7 @@ class MixtureFilter(AbstractSizedFilter):
         # Innovation of the mixture, angles near that of the most probable combination.
         value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
         innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
-        modes = jnp.zeros(len(law)).at[c.mode].add(weight)
+        modes = weight @ (c.mode[:, None] == jnp.arange(len(law)))
         after = above_rounding(symmetrize(after), spread, initial_size(at(self.plant, 0)))
         updated = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation

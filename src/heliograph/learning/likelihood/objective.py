@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -178,8 +179,14 @@ def objectives(network: Description, by_truth: bool = False) -> list[Objective]:
     """
     if by_truth:
         sole_filter(network.start)
-        return [Objective(network, "truth")]
-    return [Objective(network, form) for form in forms_of(network.start)]
+        return [_shared(Objective(network, "truth"))]
+    return [_shared(Objective(network, form)) for form in forms_of(network.start)]
+
+
+@lru_cache
+def _shared(objective: Objective) -> Objective:
+    """Return the first one equal to this: to find its program again, it need not be compared."""
+    return objective
 
 
 def forms_of(network: Network) -> list[Form]:

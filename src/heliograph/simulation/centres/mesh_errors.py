@@ -14,7 +14,7 @@ from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.recursion import information_step
 from heliograph.model.estimate import Claim
-from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.check import check_count, fail, instance, is_whole
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
@@ -299,7 +299,7 @@ def _flags(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds de
     if mesh.edges.past:
         raise fail("errors between neighbours before any data", "messages that arrive at once or are lost", "late ones")
     shape = (len(mesh.senders), mesh.edges.rounds, mesh.senders.shape[1])
-    if isinstance(arrived, int | np.integer) and not isinstance(arrived, bool):
+    if is_whole(arrived):
         return np.repeat(mesh.edges.lossless()[None], check_count("number of steps", arrived), axis=0)
     flags = np.asarray(arrived)
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
