@@ -51,11 +51,13 @@ def test_it_is_that_of_all_that_arrives_by_the_prediction_from_the_fused_estimat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["several modes", "a shared channel"])
+@pytest.mark.parametrize("case", ["several modes", "past signals", "a shared channel"])
 def test_there_is_none_where_a_state_is_more_than_a_mean_and_a_covariance_or_noises_depend_on_each_other(case):
     rule = hg.fusion.EqualIntersection()
     if case == "several modes":
         item = network(hg.gilbert_elliott(hg.hop(1.0, 0.0), hg.hop(0.2, 0.0), 0.2, 0.3), {"bound": rule})
+    elif case == "past signals":
+        item = network(hg.hop(1.0, 0.1, delay=hg.Discrete([0, 1], [0.5, 0.5])), {"bound": rule})
     else:
         both = hg.LinearSensor(np.array(ROWS), np.diag(NOISES))
         parts = {

@@ -101,8 +101,9 @@ def following_prior(estimate: Estimate) -> Belief:
 def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, FusedInnovation]:
     """Tests of the network's fusions of estimates, by name, where there is one.
 
-    There is none where a filter's state is more than a mean and a covariance, such as a mixture, or a fusion claims no
-    covariance, or where nodes share a channel, fading or relays: their measurements' noises then depend on each other.
+    There is none where a filter's state is more than a mean and a covariance of the plant's states, such as a mixture,
+    or past signals behind a link that is late by chance, or a fusion claims no covariance, or where nodes share a
+    channel, fading or relays: their measurements' noises then depend on each other.
     """
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
@@ -113,6 +114,7 @@ def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, Fus
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
             sources, _ = gathering(network, places, network.nodes_with(fusion.filter), fusion.filter)
-            if all(isinstance(eqx.filter_eval_shape(alike[kind].init), WHOLE) for kind, _ in sources):
+            beliefs = [eqx.filter_eval_shape(alike[kind].init) for kind, _ in sources]
+            if all(isinstance(b, WHOLE) and b.mean.shape[-1] == len(network.states) for b in beliefs):
                 tests[name] = FusedInnovation(start, sources)
     return tests
