@@ -60,12 +60,18 @@ def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:
     Filters of one structure are one program, whatever their numbers: a property is tried on all of them at once.
     """
     rows, groups = np.asarray(z), {}
+    # An item that stands there several times is taken apart once.
+    known = {id(item): jax.tree.flatten(item) for item in items}
     for i, item in enumerate(items):
-        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(item))
-        groups.setdefault((jax.tree.structure(item), shapes), []).append(i)
+        leaves, structure = known[id(item)]
+        groups.setdefault((structure, tuple(map(np.shape, leaves))), []).append(i)
     parts, order = [], np.concatenate([*groups.values()])
-    for members in groups.values():
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in members])
+    for (structure, _), members in groups.items():
+        names = [id(items[i]) for i in members]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        columns = zip(*(known[name][0] for name in numbers), strict=True)
+        of_each = np.array([numbers[name] for name in names])
+        stacked = jax.tree.unflatten(structure, [np.stack(column)[of_each] for column in columns])
         data, inputs = _padded(rows[members], np.zeros((*rows[members].shape[:2], 0)), ROWS_OF_EACH)
         parts.append(_cut(_followed(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[np.argsort(order)], *parts)

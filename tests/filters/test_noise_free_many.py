@@ -5,6 +5,9 @@ squared error of eight runs may be a thousand times the claim's mean, which chan
 networks, or is within ten roundings of the state.
 """
 
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -50,6 +53,15 @@ def simulated(random, plant, sensor):
         states.append(x)
         outputs.append(x @ sensor.matrix.T + drawn(random, sensor.noise))
     return np.stack(states, axis=1), np.stack(outputs, axis=1)
+
+
+@cache
+def networks(shape, nearly):
+    """Plants, sensors, states, outputs, and a generator for what becomes of these: drawn once for all kinds."""
+    n, m = shape
+    generators = [np.random.default_rng([seed, n, m]) for seed in range(NETWORKS)]
+    models = [parts(random, n, m, nearly) for random in generators]
+    return [(*model, *simulated(random, *model), random) for model, random in zip(models, generators, strict=True)]
 
 
 def dropped(y, random, chance, instead):
@@ -103,14 +115,10 @@ KINDS = {  # by name, the filter of a plant, a sensor and its outputs, and what 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_claim_is_broken(kind, shape, nearly):
     build, received = KINDS[kind]
-    n, m = shape
     items, data, truth, start = [], [], [], []
-    for seed in range(NETWORKS):
-        random = np.random.default_rng([seed, n, m])
-        plant, sensor = parts(random, n, m, nearly)
-        states, outputs = simulated(random, plant, sensor)
-        items += [build(plant, sensor, m)] * RUNS
-        data += [*received(outputs, random)]
+    for plant, sensor, states, outputs, random in networks(shape, nearly):
+        items += [build(plant, sensor, shape[1])] * RUNS
+        data += [*received(outputs, deepcopy(random))]
         truth.append(states)
         start.append(np.abs(plant.initial_mean))
     steps, truth = follow_each(items, np.stack(data)), np.stack(truth)

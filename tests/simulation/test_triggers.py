@@ -149,7 +149,7 @@ BOX, STEPS = ([0.4, 0.5], "box"), ([0.4, 0.5], "each")
         (ALONE, hg.SendOnDelta(STEPS[0], region="each", losses="numbered")),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnPredictionError(BOX[0])),
         (hg.perfect(2), hg.SendOnDelta(0.5, region="ball")),
-        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", heartbeat=30)),
+        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", heartbeat=10)),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", reference="acknowledged")),
     ],
     ids=[

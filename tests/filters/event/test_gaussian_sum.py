@@ -171,9 +171,8 @@ def test_the_stochastic_trigger_claims_exactly_only_where_the_posterior_is_a_gau
 )  # fmt: skip
 def test_every_rule_gives_a_filter_of_the_contract(trigger):
     item = hg.event_filter(PLANT, SENSOR, LOSSY, trigger)
-    state = item.init()
-    state, innovation = item.correct(item.predict(state), [0.4])
-    assert np.isfinite(innovation.log_likelihood) and np.isfinite(item.estimate(state).covariance)
+    result = follow(item, [0.4])
+    assert np.isfinite(result.innovation.log_likelihood) and np.isfinite(result.covariance)
     check_filter(item)
 
 

@@ -77,18 +77,21 @@ def test_a_recording_gives_what_the_run_gave(lossy, record):
             assert np.asarray(now.covariance) == pytest.approx(np.asarray(then.covariance)[3], rel=1e-9)
 
 
+@pytest.fixture(scope="module")
+def statistics():
+    """Over 960 runs of 40 steps with losses in bursts."""
+    rules = {"trace": RULES["trace"], "best": RULES["best"]}
+    return hg.monte_carlo(network(rules, link=BURSTS), 40, 960, 1, hg.Statistics())
+
+
 @pytest.mark.slow
-def test_statistics_have_each_node(lossy):
-    statistics = hg.monte_carlo(lossy, STEPS, 64, 4, hg.Statistics())
+def test_statistics_have_each_node(statistics):
     assert statistics["b"]["trace"].claim == "upper"
-    assert statistics["b"]["trace"].runs == 64 and np.isfinite(statistics["b"]["trace"].rmse()[0])
+    assert statistics["b"]["trace"].runs == 960 and np.isfinite(statistics["b"]["trace"].rmse()[0])
 
 
 @pytest.mark.slow
-def test_bursts_leave_upper_claims_upper_and_exact_ones_exact():
-    rules = {"trace": hg.fusion.TraceIntersection(), "best": hg.fusion.MatrixWeights()}
-    net = network(rules, link=BURSTS)
-    statistics = hg.monte_carlo(net, 40, 960, 1, hg.Statistics())
+def test_bursts_leave_upper_claims_upper_and_exact_ones_exact(statistics):
     for node in "abcd":
         assert statistics[node]["trace"].nees_per_dimension()[0] < 1.05
         assert statistics[node]["best"].nees_per_dimension()[0] == pytest.approx(1.0, abs=0.06)
@@ -338,11 +341,13 @@ def test_best_weights_of_many_nodes_are_refused_where_they_would_be_stepped():
 
 
 @pytest.mark.slow
-def test_a_timeline_has_every_node_where_no_message_gets_lost(lossy):
+def test_a_timeline_has_every_node_where_no_message_gets_lost():
     whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
     z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}
     expected = hg.run(whole, z).estimates["b"]["trace"]
-    timeline = hg.Timeline(lossy, window=10.0)  # within a process nothing gets lost
+    timeline = hg.Timeline(
+        network({"trace": RULES["trace"]}, link=LINK), window=10.0
+    )  # within a process nothing gets lost
     for k in range(3):
         for name in ("a", "c", "d"):
             assert timeline.push(name, k, float(k), z[name][k]) == "used"

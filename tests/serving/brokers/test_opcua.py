@@ -142,7 +142,7 @@ def test_a_change_is_a_step_of_a_node_whose_sender_has_the_deadband():
         url = f"opc.tcp://127.0.0.1:{port}/plant"
         rule = (await asyncio.to_thread(read_reporting, url, [VARIABLE]))[VARIABLE]
         plant, sensor = hg.LinearPlant([[1.0]], 0.01, [20.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
-        trigger = rule.trigger(heartbeat=600)
+        trigger = rule.trigger()
         item = hg.event_filter(plant, sensor, hg.perfect(), trigger)
         net = hg.Network(plant, {"boiler": hg.Node(sensor, hg.perfect(), {"f": item}, trigger=trigger)})
         field = hg.files.json_field("value", "boiler", time="source_time", step=rule.interval)
