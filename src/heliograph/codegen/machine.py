@@ -75,7 +75,8 @@ class Tiers:
         """Return code that is about to be executed for so many blocks of runs."""
         with self._lock:
             self._executions += blocks * self._source.work / max(self._source.operations, 1)
-            level = int(self._executions >= often(self._source.operations) and not jax.config.values["jax_disable_most_optimizations"])
+            careful = self._executions >= often(self._source.operations)
+            level = int(careful and not jax.config.values["jax_disable_most_optimizations"])
             if self._machine is None or self._machine.level < level:
                 self._machine = Machine(self._source.text, level)
             return self._machine
