@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.compiled import compile
-from heliograph.codegen.machine import FEW, MANY, OFTEN, often
+from heliograph.codegen.machine import SMALL, LARGE, OFTEN, often
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
@@ -54,7 +54,13 @@ def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code)
 
 
 def test_small_programs_wait_less_for_care():
-    assert [OFTEN / often(n) for n in (1, FEW, MANY // 2, MANY, 10 * MANY)] == [MANY / FEW, MANY / FEW, 2, 1, 1]
+    assert [OFTEN / often(n) for n in (1, SMALL, LARGE // 2, LARGE, 10 * LARGE)] == [
+        LARGE / SMALL,
+        LARGE / SMALL,
+        2,
+        1,
+        1,
+    ]
 
 
 def test_a_call_that_executes_its_code_often_waits_for_care(code):

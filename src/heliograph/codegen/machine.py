@@ -17,7 +17,7 @@ SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_in
 # Executions of each operation of a program after which care pays: it takes LLVM 20 to 90 us an operation more, and
 # saves a seventh to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000
 # operations, it pays after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner.
-OFTEN, FEW, MANY = 500_000, 1_000, 10_000  # executions of programs of MANY operations; in proportion down to FEW
+OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000  # executions of programs of LARGE operations; in proportion down to SMALL
 ALWAYS = math.inf  # executions of code in live use, which a later call must not generate again
 
 
@@ -57,7 +57,7 @@ class Machine:
 
 def often(operations: int) -> float:
     """Return the executions after which care pays for a program of so many operations."""
-    return OFTEN * min(max(operations, FEW), MANY) / MANY
+    return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
 
 
 class Tiers:
