@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.compiled import compile
-from heliograph.codegen.machine import SMALL, LARGE, OFTEN, often
+from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
