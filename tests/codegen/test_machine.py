@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.codegen.compiled import compile
-from heliograph.codegen.machine import OFTEN
+from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
@@ -44,13 +44,23 @@ def level(code):
 def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code):
     """Two blocks of 500 steps a call; the numbers are the same bits before and after."""
     source = code.code.blocks
-    often = -(-OFTEN // (2 * source.work / source.operations))
-    calls = [code(STARTS) for _ in range(int(often) - 1)]
+    count = -(-often(source.operations) // (2 * source.work / source.operations))
+    calls = [code(STARTS) for _ in range(int(count) - 1)]
     assert level(code) == 0
     calls.append(code(STARTS))
     assert level(code) == 1
     for a, b in zip(*map(jax.tree.leaves, (calls[0], calls[-1])), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_small_programs_wait_less_for_care():
+    assert [OFTEN / often(n) for n in (1, SMALL, LARGE // 2, LARGE, 10 * LARGE)] == [
+        LARGE / SMALL,
+        LARGE / SMALL,
+        2,
+        1,
+        1,
+    ]
 
 
 def test_a_call_that_executes_its_code_often_waits_for_care(code):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.special import i0e
 
 import heliograph as hg
 from heliograph.live.stepper import NativeStepper, XlaStepper
@@ -151,9 +152,9 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
 
 @pytest.mark.slow
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
-    """One that adds up what data say belongs together; by native code alone it is refused in one line."""
-    hop = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 0.1, dimension=2)
-    item = hg.filters.mixture_filter(PLANT, SENSOR, hop)
+    """One of a plant with a Bessel function; by native code alone it is refused in one line."""
+    plant = hg.Plant(lambda x, u: 0.5 * x + i0e(x) * u, 0.1 * np.eye(2), [1.0, -1.0], np.eye(2), inputs=["push"])
+    item = hg.cubature_filter(plant, SENSOR, hg.hop(1.0, 0.1, dimension=2))
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     with pytest.raises(ValueError, match="native code: expected a program of operations that it takes") as caught:
         hg.Stream(item)

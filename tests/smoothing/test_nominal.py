@@ -24,24 +24,18 @@ def test_a_central_filter_without_random_gains_smooths_as_one_that_receives_all_
     np.testing.assert_allclose(result.covariance, known.covariance, rtol=0, atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def remembering():
-    """Statistics of an uncertain chain and of multiple models, each behind a link of its own."""
-    nodes = {}
-    for kind, radius, make in (
-        ("uncertain chain", 0.02, hg.linear_filter),
-        ("multiple models", 0.0, hg.filters.imm_filter),
-    ):
-        road = hg.random_affine.MarkovChain([[0.95, 0.05], [0.1, 0.9]], radius=radius)
-        link = hg.markov_fading([1.0, 0.3], road, 0.05)
-        nodes[kind] = hg.Node(SENSOR, link, {"one": make(PLANT, SENSOR, link)})
-    return hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 1, keep=hg.Statistics(), smooth=INTERVAL)
+REMEMBERING = {"uncertain chain": (0.02, hg.linear_filter), "multiple models": (0.0, hg.filters.imm_filter)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["uncertain chain", "multiple models"])
-def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(remembering, kind):
-    filtered, smoothed = remembering[kind]["one"], remembering.smoothed[kind]["one"]
+@pytest.mark.parametrize("kind", REMEMBERING)
+def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(kind):
+    radius, make = REMEMBERING[kind]
+    road = hg.random_affine.MarkovChain([[0.95, 0.05], [0.1, 0.9]], radius=radius)
+    link = hg.markov_fading([1.0, 0.3], road, 0.05)
+    network = hg.Network(PLANT, {kind: hg.Node(SENSOR, link, {"one": make(PLANT, SENSOR, link)})})
+    result = hg.monte_carlo(network, HORIZON, RUNS, 1, keep=hg.Statistics(), smooth=INTERVAL)
+    filtered, smoothed = result[kind]["one"], result.smoothed[kind]["one"]
     assert smoothed.claim == "nominal"
     assert smoothed.rmse()[0] < 0.95 * filtered.rmse()[0]
     assert smoothed.nees_per_dimension()[0] < 1.2

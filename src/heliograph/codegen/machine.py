@@ -16,8 +16,8 @@ SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_in
 
 # Executions of each operation of a program after which care pays: it takes LLVM 20 to 90 us an operation more, and
 # saves a seventh to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000
-# operations, it pays after 160,000 to 1,600,000.
-OFTEN = 500_000
+# operations, it pays after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner.
+OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000  # executions of programs of LARGE operations; in proportion down to SMALL
 ALWAYS = math.inf  # executions of code in live use, which a later call must not generate again
 
 
@@ -55,10 +55,15 @@ class Machine:
         self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
 
 
+def often(operations: int) -> float:
+    """Return the executions after which care pays for a program of so many operations."""
+    return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
+
+
 class Tiers:
     """Code of one text, generated again with care when its executions have cost as much as that.
 
-    A program that is executed `OFTEN` is generated with care at once, if its first call says so. Both have the same
+    A program that is executed `often` is generated with care at once, if its first call says so. Both have the same
     results, bit for bit, so that nothing but time depends on earlier calls.
     """
 
@@ -70,7 +75,8 @@ class Tiers:
         """Return code that is about to be executed for so many blocks of runs."""
         with self._lock:
             self._executions += blocks * self._source.work / max(self._source.operations, 1)
-            level = int(self._executions >= OFTEN and not jax.config.values["jax_disable_most_optimizations"])
+            careful = self._executions >= often(self._source.operations)
+            level = int(careful and not jax.config.values["jax_disable_most_optimizations"])
             if self._machine is None or self._machine.level < level:
                 self._machine = Machine(self._source.text, level)
             return self._machine

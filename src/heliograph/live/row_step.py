@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import chosen
+from heliograph.codegen.lowering import like
 from heliograph.live.static import Static, cast
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
@@ -19,6 +20,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
+TEXTS = 16  # programs held as text, of up to a megabyte each
 TOGETHER, WIDTH = 16, 512  # rows of one turn of XLA's loop, which fill the vectors of a processor; rows of one call
 
 
@@ -123,9 +125,9 @@ class RowStep:
     def __init__(self, network: Network, filters: AllFilters, start: PyTree):
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
         numbers, static = cast(NetworkStep(network, filters))
-        data = numbers, start, np.zeros(received), np.zeros(inputs), np.asarray(0)
-        like = jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], *data)
-        self.state, self.outputs = flat_like(start), flat_like(like)
+        self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
+        self.state = flat_like(start)
+        self.outputs = _outputs(static, self._like, self.state, received, inputs)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         self._layout = Layout(static, self.state, self.outputs, received, inputs)
         self._numbers = [np.asarray(leaf) for leaf in numbers]
@@ -144,9 +146,7 @@ class RowStep:
     @cached_property
     def program(self) -> str:
         """Return the lowered step as text, which two processes compare to see that they compute the same."""
-        with jax.enable_x64(True):
-            lowered = jax.jit(_stepped(self._layout)).lower(self._numbers, np.zeros(self._layout.size))
-        return str(lowered.as_text())
+        return _text(self._layout, self._like)
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Step each row; `alone`: calls with a single row, for which XLA needs no loop."""
@@ -174,6 +174,24 @@ def _stepped(layout: Layout) -> Callable[[list[jax.Array], jax.Array], jax.Array
         return jnp.concatenate([row_of(after), row_of(outputs)])
 
     return step
+
+
+@lru_cache
+def _outputs(
+    static: Static, numbers: tuple[jax.ShapeDtypeStruct, ...], state: Flat, received: int, inputs: int
+) -> Flat:
+    """Return the layout of a step's outputs: it is traced once for networks that differ in numbers alone."""
+    before = state.structure.unflatten(map(like, state.shapes, map(np.dtype, state.kinds)))
+    data = list(numbers), before, np.zeros(received), np.zeros(inputs), np.asarray(0)
+    with jax.enable_x64(True):
+        return flat_like(jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], *data))
+
+
+@lru_cache(TEXTS)
+def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
+    """Return the lowered step as text, once for networks that differ in numbers alone."""
+    with jax.enable_x64(True):
+        return str(jax.jit(_stepped(layout)).lower(list(numbers), np.zeros(layout.size)).as_text())
 
 
 @lru_cache

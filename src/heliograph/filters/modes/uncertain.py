@@ -180,11 +180,11 @@ def _bounds(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array)
 
 def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
-    order = jnp.argsort(-payoff)
-    room = (high - low)[order]
-    before = jnp.cumsum(room) - room
-    given = jnp.clip(1 - jnp.sum(low) - before, 0.0, room)
-    return low @ payoff + given @ payoff[order]
+    number = jnp.arange(len(payoff))
+    earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
+    room = high - low
+    given = jnp.clip(1 - jnp.sum(low) - room @ earlier, 0.0, room)
+    return (low + given) @ payoff
 
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
