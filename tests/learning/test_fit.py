@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.objective import gathered
+from heliograph.learning.likelihood.data import gathered
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.solution import Solution
 from tests.oracles.learning_links import likelihood

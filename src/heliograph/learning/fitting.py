@@ -10,8 +10,9 @@ from typing_extensions import TypeAliasType
 from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
+from heliograph.learning.likelihood.data import gathered
 from heliograph.learning.likelihood.maximise import Maximum
-from heliograph.learning.likelihood.objective import Form, gathered, objectives
+from heliograph.learning.likelihood.objective import Form, objectives
 from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender

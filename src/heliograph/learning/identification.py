@@ -9,7 +9,8 @@ import numpy as np
 
 from heliograph.learning.description import Build, describe
 from heliograph.learning.intervals import quantile
-from heliograph.learning.likelihood.objective import Data, Objective, joint_world, objectives
+from heliograph.learning.likelihood.data import Data
+from heliograph.learning.likelihood.objective import Objective, joint_world, objectives
 from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text

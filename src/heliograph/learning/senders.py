@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
-from heliograph.learning.likelihood.objective import gathered
+from heliograph.learning.likelihood.data import gathered
 from heliograph.learning.losses.delays import DelaysByNode
 from heliograph.learning.solution import TWO_SIDED, Row
 from heliograph.numerics.check import fail

@@ -5,6 +5,12 @@ import numpy as np
 import heliograph as hg
 
 PLANT = hg.LinearPlant([[1.02, 0.3], [0.0, 0.9]], [[0.2, 0.05], [0.05, 0.1]], [1.0, -2.0], [[1.0, 0.2], [0.2, 0.5]])
+LINK = hg.erasure(hg.perfect(), 0.7)
+RULES = {
+    "best": hg.fusion.MatrixWeights(),
+    "trace": hg.fusion.TraceIntersection(),
+    "diffusion": hg.fusion.DiffusionWeights(),
+}
 ROWS = {"a": ([[1.0, 0.0]], 0.3), "c": ([[0.4, 1.0]], 0.5), "d": ([[1.0, 0.2], [0.0, 1.0]], np.diag([0.8, 1.5]))}
 RING = {"a": ["b"], "b": ["c", "d"], "c": ["a", "b"], "d": ["c"]}  # b has no sensor
 NODES = ("a", "b", "c", "d")

@@ -6,7 +6,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.learning.description import describe
-from heliograph.learning.likelihood.objective import Data, _by_xla, at_points, objectives
+from heliograph.learning.likelihood.data import Data
+from heliograph.learning.likelihood.objective import _by_xla, at_points, objectives
 
 STEPS, RECORDINGS = 157, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from heliograph.learning.likelihood.data import Data
 from heliograph.learning.likelihood.maximise import Evaluated, Maximum, maximise
-from heliograph.learning.likelihood.objective import Data, Evaluation, Objective, at_points
+from heliograph.learning.likelihood.objective import Evaluation, Objective, at_points
 from heliograph.numerics.types import Bool, Float
 
 DIFFERENCE = 1e-3  # standard errors over which scores are differenced

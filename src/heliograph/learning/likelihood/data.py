@@ -1,0 +1,135 @@
+"""Recordings of a fit, gathered and checked against the network."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.filters.rows import rows
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.types import Float
+from heliograph.simulation.network import Network
+
+FEWEST = 10  # numbers that arrived for each free one
+
+
+class Data(NamedTuple):
+    """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
+
+    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
+    truth (recordings, steps, n), the true states where these are learned from, NaN where they are not known.
+    """
+
+    measurements: Float[np.ndarray, "recordings steps received"]
+    inputs: Float[np.ndarray, "recordings steps inputs"]
+    lengths: tuple[int, ...]
+    truth: Float[np.ndarray, "recordings steps n"] | None = None
+
+
+def gathered(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
+    """Gather all recordings, checked against the network, as `Data`; with true states where these are asked for.
+
+    Raises:
+        ValueError: recordings of other shapes, too short, or without any change.
+    """
+    several = (
+        recording if isinstance(recording, list | tuple) and not hasattr(recording, "measurements") else [recording]
+    )
+    if not len(several):
+        raise fail("recordings", "at least one", "none")
+    # every run of every recording, then all filled up to the longest
+    parts = [run for i, single in enumerate(several) for run in _parts(network, single, _inputs_of(inputs, i, several))]
+    for z, _ in parts:
+        network.check_horizon(len(z))
+    longest = max(len(z) for z, _ in parts)
+    true = [] if truth is False else _truths(network, several, truth, [len(z) for z, _ in parts])
+    data = Data(
+        np.stack([_filled(z, longest, np.nan) for z, _ in parts]),
+        np.stack([_filled(u, longest, None) for _, u in parts]),
+        tuple(len(z) for z, _ in parts),
+        np.stack([_filled(x, longest, np.nan) for x in true]) if true else None,
+    )
+    _check_enough(data, free)
+    return data
+
+
+def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
+    if not isinstance(inputs, list | tuple):
+        return inputs
+    if len(inputs) != len(several):
+        raise fail("inputs", f"those of each of the {len(several)} recordings", f"{len(inputs)} of them")
+    return inputs[index]
+
+
+def _truths(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
+    """True states (steps, n) of each run of each recording, NaN where they are not known.
+
+    Raises:
+        ValueError: recordings without them, other shapes.
+    """
+    held = [getattr(single, "truth", None) for single in several] if truth is True else truth
+    listed = held if isinstance(held, list | tuple) and len(held) == len(several) else [held]
+    if len(listed) != len(several) or any(single is None for single in listed):
+        got = "none" if truth is True else f"{len(listed)} of them"
+        raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
+    runs = [run for states in map(np.asarray, listed) for run in (states if states.ndim == 3 else [states])]
+    if len(runs) != len(steps):
+        raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
+    return [array("truth", run, (count, len(network.states)), missing=True)
+            for run, count in zip(runs, steps, strict=True)]  # fmt: skip
+
+
+def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
+    held = getattr(recording, "measurements", recording)
+    known = getattr(recording, "inputs", None) if inputs is None else inputs
+    # measurements by node
+    if not isinstance(held, Mapping):
+        if len(network.names) > 1:
+            raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
+        held = {network.names[0]: held}
+    if set(held) != set(network.names):
+        raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
+    # each run: the nodes' columns side by side, and the inputs
+    runs = _runs([np.asarray(held[name]) for name in network.names])
+    results = []
+    for run in runs:
+        columns: list[np.ndarray] = []
+        for name, z in zip(network.names, run, strict=True):
+            like = len(columns[0]) if columns else None
+            measured = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(measured))
+        steps, count = len(columns[0]), len(network.inputs)
+        if known is None and count:
+            raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
+        u = np.zeros((steps, 0)) if known is None else rows("inputs", known, steps, count, missing=False)
+        results.append((np.concatenate(columns, axis=1), np.asarray(u)))
+    return results
+
+
+def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
+    """Runs of a simulation one by one; a recording is one."""
+    if all(value.ndim == 3 for value in values):
+        return [list(run) for run in zip(*values, strict=True)]
+    return [values]
+
+
+def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
+    """Array with rows added up to a length: of a filler, or copies of the last one."""
+    more = length - len(values)
+    end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
+    return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values
+
+
+def _check_enough(data: Data, free: int) -> None:
+    z = data.measurements if data.truth is None else data.truth
+    count = int(np.count_nonzero(~np.isnan(z)))
+    if count < FEWEST * free:
+        known = "that arrived" if data.truth is None else "of the truth"
+        raise fail("recording", f"at least {FEWEST * free} numbers {known} for {free} free ones", count)
+    z = data.measurements
+    flat = z.reshape(-1, z.shape[-1])
+    received = [column[~np.isnan(column)] for column in flat.T]
+    still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
+    if len(still) == sum(len(column) > 0 for column in received):
+        raise fail("recording", "measurements that vary", f"{array('m', received[still[0]], (None,))[0]:g} throughout")
