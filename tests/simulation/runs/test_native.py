@@ -98,9 +98,7 @@ class Both(AbstractReducer):
 
     def others(self, filtered, smoothed, claims):
         reducers = Trajectories(), hg.Statistics()
-        return tuple(
-            reducer.others(*both, claims) for reducer, *both in zip(reducers, filtered, smoothed, strict=True)
-        )
+        return tuple(reducer.others(*both, claims) for reducer, *both in zip(reducers, filtered, smoothed, strict=True))
 
 
 def by(engine: str, *args: object, **kwargs: object) -> object:
