@@ -1,5 +1,7 @@
 """Code in haste, and with care once its executions have cost as much: the same bits."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from heliograph.codegen.compiled import compile
 from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
+from heliograph.codegen.nodes import Node
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
@@ -78,3 +81,17 @@ def test_prepared_code_is_not_generated_again(code):
 def test_no_code_is_generated_with_care_without_optimizations(code):
     jax.config.update("jax_disable_most_optimizations", True)
     assert code.blocks.machine(2 * OFTEN).level == 0
+
+
+def test_code_lets_go_of_the_program_that_it_was_made_of():
+    """Which takes more memory than the code; only its text stays, to be generated again with care."""
+
+    def nodes():
+        gc.collect()
+        return sum(isinstance(x, Node) for x in gc.get_objects())
+
+    before = nodes()
+    code = compile(rotated, STARTS[0])
+    code(STARTS)
+    assert nodes() == before
+    assert "define void @run" in code.code.blocks.text
