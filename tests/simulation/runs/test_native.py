@@ -1,5 +1,7 @@
 """Networks simulated by native code: what XLA gives, whoever else is simulated and however runs are dealt."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.codegen.engine import SETTING
-from heliograph.codegen.nodes import Unsupported
+from heliograph.codegen.nodes import Node, Unsupported
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
@@ -259,3 +261,20 @@ def test_keys_of_another_hash_are_simulated_by_xla():
     world = World(network.plant, medium_of(network), AllFilters(network))
     with pytest.raises(Unsupported, match="rbg"):
         native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)
+
+
+def test_of_a_program_that_is_refused_the_reason_stays_alone():
+    """A program of 200,000 operations is 100 MB, which a traceback would hold."""
+    plant = hg.Plant(lambda x, u: x / (1 + jnp.linalg.svd(jnp.outer(x, x))[1]), 0.1 * np.eye(2), np.ones(2), np.eye(2))
+    network = hg.Network(plant, {"a": hg.Node(POSITION, hg.perfect(), {})})
+    world = World(plant, medium_of(network), AllFilters(network))
+
+    def nodes():
+        gc.collect()
+        return sum(isinstance(x, Node) for x in gc.get_objects())
+
+    before = nodes()
+    for _ in range(2):
+        with pytest.raises(Unsupported, match="svd"):
+            native(world, np.zeros((3, 0)), seed_key(0), Trajectories(), 8)
+    assert nodes() == before

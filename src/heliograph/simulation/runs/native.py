@@ -123,7 +123,7 @@ def _made(
     try:
         return _program(tree, held, fixed, known)
     except Unsupported as error:
-        return error
+        return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
 def _program(
