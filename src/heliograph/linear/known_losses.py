@@ -83,8 +83,8 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     """Find gains of a small steady bound on E P: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
 
     The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
-    converge or are found to keep E P bounded; policy iteration, which then converges faster, improves them. Where the result is not certified, gains A C+ are tried, with which an
-    output that shows all of x leaves no old error.
+    converge or are found to keep E P bounded; policy iteration, which then converges faster, improves them. Where the
+    outcome is not certified, gains A C+ are tried, with which an output that shows all of x leaves no old error.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
