@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import computed
 from heliograph.live.later import Sweeper
 from heliograph.live.row_step import RowStep
 from heliograph.live.snapshot import Identity, network_identity
@@ -15,6 +16,7 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
@@ -74,14 +76,22 @@ def _moved(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return state, Jacobian and noise covariance after these intervals."""
     n = len(x)
-    state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
+    state, matrix, spread = x, np.eye(n), np.zeros((n, n))
     for interval in parts:
-        u = jnp.ones(len(plant.inputs)).at[dt].set(interval)
-        a = jax.jacfwd(plant.transition)(state, u)
-        state, matrix, spread = (
-            plant.transition(state, u) + plant.noise_mean(), a @ matrix, a @ spread @ a.T + plant.noise_covariance(u),
-        )  # fmt: skip
-    return np.asarray(state), np.asarray(matrix), np.asarray(spread)
+        u = np.ones(len(plant.inputs))
+        u[dt] = interval
+        state, a, noise = computed(_over_interval, _over_interval_by_xla, (plant, state, u))
+        matrix, spread = a @ matrix, a @ spread @ a.T + noise
+    return state, matrix, spread
+
+
+def _over_interval(plant: AbstractPlant, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return state, Jacobian and noise covariance after an interval."""
+    following = jnp.asarray(plant.transition(x, u) + plant.noise_mean())
+    return following, jax.jacfwd(plant.transition)(x, u), jnp.asarray(plant.noise_covariance(u))
+
+
+_over_interval_by_xla = quickly_compiled(_over_interval)
 
 
 class JudgementAt(NamedTuple):
