@@ -121,8 +121,8 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.check_process()
-        result: R = computed(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
-        return result
+        returned: R = computed(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        return returned
 
     return call
 
