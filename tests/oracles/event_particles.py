@@ -8,7 +8,7 @@ from scipy.special import ndtr, ndtri
 
 
 class Problem(NamedTuple):
-    """x+ = A x + N(0, Q), y = h(x) + N(0, r), x_0 ~ N(0, P), h of columns (n, particles); a link of modes with losses."""
+    """x+ = A x + N(0, Q), y = h(x) + N(0, r), x_0 ~ N(0, P), x (n, particles); a link of modes with a loss in each."""
 
     a: np.ndarray
     q: np.ndarray
