@@ -105,8 +105,25 @@ def test_what_is_not_lowered_is_refused_with_its_operation_and_place():
         lower(lambda x: jnp.linalg.svd(x)[1], X)
 
 
-def test_a_loop_mapped_over_entries_is_left_to_xla():
-    def doubled(x):
-        return jax.vmap(lambda v: jax.lax.while_loop(lambda c: c < 3.0, lambda c: 2 * c, v))(x)
+def test_a_loop_over_an_axis_ends_for_each_entry_when_its_condition_fails():
+    """Each run, row and column: a vector doubled and a key split until the sum is above a number of its own."""
 
-    assert engine_of(doubled, np.ones((2, 3))).startswith("xla: a condition for each entry of an array at ")
+    def doubled(x, words):
+        def single(limit, words):
+            key = jax.random.wrap_key_data(words)
+            grown = jnp.ones(2), jnp.array(0), key
+            again = lambda c: (2 * c[0] + c[1], c[1] + 1, jax.random.fold_in(c[2], 1))  # noqa: E731
+            sums, count, key = jax.lax.while_loop(lambda c: jnp.sum(c[0]) < limit, again, grown)
+            return sums, count, jax.random.key_data(key)
+
+        return jax.vmap(jax.vmap(single))(x, words)
+
+    draw = np.random.default_rng(0)
+    limits, words = draw.uniform(0, 50, (5, 2, 3)), draw.integers(0, 9, (5, 2, 3, 2), dtype=np.uint32)
+    limits[0, 0, 0] = np.nan
+    assert engine_of(doubled, limits, words).startswith("native: ")
+    with jax.enable_x64(True):
+        expected = [np.asarray(x) for x in jax.jit(jax.vmap(doubled))(limits, words)]
+    for x, y in zip(hg.simulation.over_runs(doubled, limits, words), expected, strict=True):
+        np.testing.assert_array_equal(x, y)  # doubling and adding small integers is exact
+    assert len(np.unique(expected[1])) > 3

@@ -1,5 +1,7 @@
 """Code in haste, and with care once its executions have cost as much: the same bits."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from heliograph.codegen import compiled
 from heliograph.codegen.compiled import Alone, compile
 from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
+from heliograph.codegen.nodes import Node
 from heliograph.codegen.program import lower
 
 STEPS = 500
@@ -92,3 +95,17 @@ def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):
         step()
     for a, b in zip(careful.outputs, hasty.outputs, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_code_lets_go_of_the_program_that_it_was_made_of():
+    """Which takes more memory than the code; only its text stays, to be generated again with care."""
+
+    def nodes():
+        gc.collect()
+        return sum(isinstance(x, Node) for x in gc.get_objects())
+
+    before = nodes()
+    code = compile(rotated, STARTS[0])
+    code(STARTS)
+    assert nodes() == before
+    assert "define void @run" in code.code.blocks.text

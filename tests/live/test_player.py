@@ -5,6 +5,8 @@ import logging
 import jax
 
 import heliograph as hg
+from heliograph.live.lanes import Lanes
+from heliograph.simulation.stepping import AllFilters
 from tests.live import worlds
 
 FEW = 4  # programs: the filters begin by one; there were 136
@@ -18,3 +20,13 @@ def test_a_timeline_begins_with_few_programs(caplog):
         hg.Timeline(network, 4.0, capacity=30)
     compiled = [line for line in map(logging.LogRecord.getMessage, caplog.records) if "XLA compilation of" in line]
     assert 0 < len(compiled) <= FEW, compiled
+
+
+def test_a_step_is_traced_once_for_its_outputs_its_code_and_its_text(monkeypatch):
+    """With all measurements, and without those that are implausible: tracing is most of what beginning costs."""
+    calls, step = [], AllFilters.step
+    monkeypatch.setattr(AllFilters, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
+    plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5, states=["traced here alone"])
+    item = hg.kalman_filter(plant, worlds.SENSOR)
+    made = Lanes(hg.Network(plant, {"a": hg.Node(worlds.SENSOR, hg.perfect(), {"f": item})})).step_rows
+    assert made.program and len(calls) == 1

@@ -20,7 +20,8 @@ class Accumulated:
 
     def __init__(self, program: Program, summed: Summed):
         differs = [n == summed.number for n in range(len(program.inputs))]
-        self.width, self.summed, self.inputs = best_width(), summed, program.inputs
+        self.width, self.summed = best_width(), summed
+        self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
         self.code = written(program, differs, self.width, features()[2], summed=summed)
         self.common = self.code.common
         self.blocks = Tiers(self.code.blocks)
@@ -39,8 +40,7 @@ class Begun:
 
     def __init__(self, program: Accumulated, arguments: Sequence[Any], runs: int):
         self.program = program
-        others = (b for n, b in enumerate(program.inputs) if n != program.summed.number)
-        self.arguments = [np.ascontiguousarray(x, dtype=DTYPES[b.type]) for x, b in zip(arguments, others, strict=True)]
+        self.arguments = [np.ascontiguousarray(x, dtype=t) for x, t in zip(arguments, program.types, strict=True)]
         self.memory = aligned(program.code.shared)
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:

@@ -83,8 +83,8 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     """Find gains of a small steady bound on E P: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
 
     The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
-    converge; policy iteration improves them. Where the result is not certified, gains A C+ are tried, with which an
-    output that shows all of x leaves no old error.
+    converge or are found to keep E P bounded; policy iteration, which then converges faster, improves them. Where the
+    outcome is not certified, gains A C+ are tried, with which an output that shows all of x leaves no old error.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
@@ -93,13 +93,15 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     # Value iteration, renormalised where covariances grow.
     noise, gains = 1.0, _improved(system, parts, 1.0)
-    for _ in range(ITERATIONS):
+    for step in range(1, ITERATIONS + 1):
         (parts,) = system.closed(gains, noise).after(parts)
         grown = np.trace(parts.sum(axis=0)) / size
         if grown > NEGLIGIBLE:
             parts, noise = parts / grown, noise / grown
         before, gains = gains, _improved(system, parts, noise)
         if _change(before, gains) < CONVERGED:
+            break
+        if step.bit_count() == 1 and system.closed(gains).radius() < BELOW_ONE:
             break
     # Policy iteration, and the certificate rho(operator) < 1.
     gains = _polished(system, gains)

@@ -1,8 +1,7 @@
 """Step of all filters of a network on rows of doubles: native code for many rows if possible, else XLA."""
 
-from collections.abc import Callable
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +14,7 @@ from heliograph.live.static import Static, cast
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.judging import implausible, plausible_step, step_without
+from heliograph.simulation.judging import implausible, plausible_step, step_with_all, step_without
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
@@ -79,7 +78,7 @@ class NetworkStep(Module):
 
     def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Step all filters with every measurement, implausible or not."""
-        after, outputs = self.filters.step(state, self.groups(received), u, k)
+        after, outputs = step_with_all(self.filters, state, self.groups(received), u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
     def without(
@@ -166,14 +165,14 @@ class RowStep:
 
 
 @lru_cache
-def _stepped(layout: Layout) -> Callable[[list[jax.Array], jax.Array], jax.Array]:
-    """Return the function of one row, the same one for layouts that are equal."""
+def _stepped(layout: Layout) -> Any:
+    """Return the function of one row, the same one for layouts that are equal, traced once for its code and text."""
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         after, outputs = layout.static.filled(numbers).step(*layout.parts(row))
         return jnp.concatenate([row_of(after), row_of(outputs)])
 
-    return step
+    return jax.jit(step, inline=True)
 
 
 @lru_cache
@@ -191,7 +190,7 @@ def _outputs(
 def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the lowered step as text, once for networks that differ in numbers alone."""
     with jax.enable_x64(True):
-        return str(jax.jit(_stepped(layout)).lower(list(numbers), np.zeros(layout.size)).as_text())
+        return str(_stepped(layout).lower(list(numbers), np.zeros(layout.size)).as_text())
 
 
 @lru_cache

@@ -1,7 +1,8 @@
 """Steps of all filters without implausible data, messages about them, and values that a sender's rule forbids."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +39,35 @@ def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, j
     }
 
 
+def _skipping(
+    filters: AllFilters,
+    states: PyTree,
+    z: Sequence[jax.Array],
+    u: jax.Array,
+    k: jax.Array,
+    drawn: Mapping[str, Drawn] | None,
+    skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]],
+) -> Stepped:
+    return filters.step(states, z, u, k, drawn, skip)
+
+
+# Traced once for the step with all data and for that without some: tracing is most of what a step takes to compile.
+_traced: Callable[..., Stepped] = eqx.filter_jit(_skipping, inline=True)  # type: ignore[call-overload]
+
+
+def step_with_all(
+    filters: AllFilters,
+    states: PyTree,
+    z: Sequence[jax.Array],
+    u: jax.Array,
+    k: jax.Array,
+    drawn: Mapping[str, Drawn] | None = None,
+) -> Stepped:
+    """Step all filters with all data, which they judge."""
+    nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
+    return _traced(filters, states, z, u, k, drawn, nothing)
+
+
 def step_without(
     filters: AllFilters,
     first: Stepped,
@@ -48,7 +78,7 @@ def step_without(
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
     """Repeat a step, where each filter skips what it judged implausible the first time."""
-    after, outputs = filters.step(states, z, u, k, drawn, reasons(first[1]))
+    after, outputs = _traced(filters, states, z, u, k, drawn, reasons(first[1]))
     return after, outputs | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
 
@@ -61,7 +91,7 @@ def plausible_step(
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
     """Step all filters without implausible data; the second step is taken only where some is."""
-    first = filters.step(states, z, u, k, drawn)
+    first = step_with_all(filters, states, z, u, k, drawn)
     stepped: Stepped = jax.lax.cond(
         implausible(first[1]), lambda: step_without(filters, first, states, z, u, k, drawn), lambda: first
     )

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import cast
 
 import equinox as eqx
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import chosen, computed
 from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
@@ -253,29 +253,37 @@ def begun(filters: AllFilters) -> PyTree:
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Precompute what does not depend on data, where all data arrive."""
-    ahead = {i: stacked for i, stacked in enumerate(filters.alike) if filters.complete[stacked.group]}
     central = filters.central if all(filters.complete) else {}
-    with jax.enable_x64(True):
-        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.smooths, np.asarray(u)))
-    done = dict(zip(ahead, planned, strict=True))
-    alike = tuple(done.get(i, stacked) for i, stacked in enumerate(filters.alike))
-    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
+    planned = [_planned(a, u) if filters.complete[a.group] else a for a in filters.alike]
+    central = {
+        name: computed(_planned_filter, _planned_by_xla, (filter, u, filters.smooths))
+        for name, filter in central.items()
+    }
+    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
     return cast(AllFilters, to_numpy(changed))
 
 
+def _planned(alike: Alike, u: Array) -> Alike:
+    """Plan filters that differ in numbers alone by one program, by native code where it supports the filter."""
+    count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
+    with jax.enable_x64(True):
+        choice = chosen(_planned_filter, arguments, (True, False, False))
+        if choice.code is None:
+            return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
+    planned = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
+    return replace(alike, filters=planned)
+
+
+def _planned_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
+    return planned_with_past(filter, u) if smooths else filter.planned(u)
+
+
+_planned_by_xla = quickly_compiled(_planned_filter)
+
+
 @quickly_compiled
-def _plan(
-    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], smooths: bool, u: jax.Array | np.ndarray
-) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
-    """Plan these filters alone: it is one program, whatever a network's fusions are."""
-
-    def single(filter: AbstractFilter, smooths: bool) -> AbstractFilter:
-        return planned_with_past(filter, u) if smooths else filter.planned(u)
-
-    planned = tuple(
-        replace(a, filters=over_all(partial(single, smooths=a.smooths), a.count * a.nodes)(a.filters)) for a in alike
-    )
-    return planned, {name: single(filter, smooths) for name, filter in central.items()}
+def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
+    return over_all(lambda filter: _planned_filter(filter, u, smooths), count)(filters)
 
 
 def plans(filters: AllFilters) -> bool:

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import computed
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, apply
 from heliograph.random_affine.delay import Delayed
@@ -45,10 +46,9 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))
-    return np.asarray(_transmitted(channel, y, np.asarray(check_seed("seed", seed))))
+    return np.asarray(computed(_transmitted, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
 
 
-@compiled
 def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
     key = jax.random.key(seed)
 
@@ -62,6 +62,9 @@ def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> j
     start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
     received: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))[1]
     return received
+
+
+_by_xla = quickly_compiled(_transmitted)
 
 
 def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:

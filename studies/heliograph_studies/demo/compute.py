@@ -11,7 +11,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.random_affine.base import apply
 from heliograph_studies import Inline, Stages, Unlisted, check_fields
 from heliograph_studies.demo import robot
@@ -101,13 +101,18 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 def relay(channel: hg.random_affine.AbstractRandomAffine, signals: np.ndarray, seed: int) -> np.ndarray:
     """Send recorded signals (rows, inputs) through the channel, drawn anew for each row; NaN stays NaN."""
     missing = np.isnan(signals)
-    return np.where(missing, np.nan, _send(channel, np.where(missing, 0.0, signals), np.asarray(seed)))
+    send, rows = _Send(channel, np.asarray(seed)), np.arange(len(signals))
+    return np.where(missing, np.nan, hg.simulation.over_runs(send, rows, np.where(missing, 0.0, signals)))
 
 
-@compiled
-def _send(channel: hg.random_affine.AbstractRandomAffine, signals: np.ndarray, seed: np.ndarray) -> jax.Array:
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(len(signals)))
-    return jax.vmap(lambda key, y: apply(channel.sample(key), y))(keys, signals)
+class _Send(Module):
+    """What arrives of a row: the channel is drawn from the seed and the row's number."""
+
+    channel: hg.random_affine.AbstractRandomAffine
+    seed: np.ndarray
+
+    def __call__(self, row: jax.Array, signal: jax.Array) -> jax.Array:
+        return apply(self.channel.sample(jax.random.fold_in(jax.random.key(self.seed), row)), signal)
 
 
 def average_noise(path: hg.random_affine.AbstractRandomAffine, signals: np.ndarray) -> float:

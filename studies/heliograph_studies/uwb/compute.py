@@ -1,8 +1,8 @@
 """What every rule makes of every drive, each with numbers that the other drives taught."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -79,9 +79,20 @@ def power(drive: Drive) -> Power:
     row = np.searchsorted(time, drive.time).clip(max=len(time) - 1)
     rssi[row, drive.anchor] = drive.power
     rssi[(distance < NEAR) | np.isnan(ranges)] = np.nan
-    count = len(drive.places)
+    rows = slice(None, None, EVERY)
+    fitted = hg.fit(_power_network(len(drive.places)), rssi[rows], -10 * np.log10(distance[rows]), starts=1)
+    by_name = {item.name: item for item in fitted.table}
+    exponent = by_name["exponent"]
+    return Power(
+        by_name["level"].estimate, exponent.estimate, exponent.low, exponent.high,
+        float(np.sqrt(by_name["variance"].estimate)),
+    )  # fmt: skip
 
-    # Level and exponent as free numbers of a sensor whose input is -10 log10(distance).
+
+@cache
+def _power_network(count: int) -> Callable[[], hg.Network]:
+    """Level and exponent as free numbers of a sensor whose input is -10 log10(distance); one for all drives."""
+
     def network() -> hg.Network:
         plant = hg.LinearPlant(
             np.zeros((count, count)), np.zeros((count, count)), np.zeros(count), np.zeros((count, count)), np.eye(count)
@@ -93,14 +104,7 @@ def power(drive: Drive) -> Power:
         )
         return hg.Network(plant, {"tag": hg.Node(sensor, hg.perfect(count), {})})
 
-    rows = slice(None, None, EVERY)
-    fitted = hg.fit(network, rssi[rows], -10 * np.log10(distance[rows]), starts=1)
-    by_name = {item.name: item for item in fitted.table}
-    exponent = by_name["exponent"]
-    return Power(
-        by_name["level"].estimate, exponent.estimate, exponent.low, exponent.high,
-        float(np.sqrt(by_name["variance"].estimate)),
-    )  # fmt: skip
+    return network
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,11 @@ def lossy():
     return network(RULES, link=LINK)
 
 
+def arrivals(net, fusion, steps, seed):
+    """First steps of a longer draw, which is one program whatever their number."""
+    return hg.simulation.mesh_arrivals(net, fusion, 80, seed)[:steps]
+
+
 def central(steps):
     """Covariance of the filter that receives every measurement, after so many steps."""
     a, q, p, h, r = models()
@@ -37,7 +42,7 @@ def central(steps):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "weights"), [("best", best), ("equal", equal), ("trace", by_trace)])
 def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, weights):
-    arrived = hg.simulation.mesh_arrivals(lossy, name, 8, 3)
+    arrived = arrivals(lossy, name, 8, 3)
     errors = hg.simulation.mesh_errors(lossy, name, arrived)
     oracle = Sources(weights)
     for k, flags in enumerate(arrived[:, :, 0]):
@@ -53,13 +58,13 @@ def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, we
 @pytest.mark.slow
 def test_an_intersection_claims_at_least_its_error_for_every_pattern(lossy):
     for seed, name in product(range(3), ("equal", "trace")):
-        errors = hg.simulation.mesh_errors(lossy, name, hg.simulation.mesh_arrivals(lossy, name, 30, seed))
+        errors = hg.simulation.mesh_errors(lossy, name, arrivals(lossy, name, 30, seed))
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
 @pytest.mark.slow
 def test_best_weights_are_no_worse_than_any_other_of_one_step(lossy):
-    arrived = hg.simulation.mesh_arrivals(lossy, "best", 2, 1)
+    arrived = arrivals(lossy, "best", 2, 1)
     result = {name: hg.simulation.mesh_errors(lossy, name, arrived).mean_trace() for name in RULES}
     assert all(result["best"][0] <= item[0] * (1 + 1e-7) for item in result.values())
 
@@ -89,9 +94,7 @@ def test_rounds_with_losses_claim_at_least_the_error_and_beat_one_round():
     result = {}
     for rounds in (1, 2):
         net = network(rules, link=LINK, rounds=rounds)
-        errors = [
-            hg.simulation.mesh_errors(net, "m", hg.simulation.mesh_arrivals(net, "m", 25, seed)) for seed in range(4)
-        ]
+        errors = [hg.simulation.mesh_errors(net, "m", arrivals(net, "m", 25, seed)) for seed in range(4)]
         assert min(np.linalg.eigvalsh(e.claimed - e.actual).min() for e in errors) > -1e-12
         result[rounds] = np.mean([e.mean_trace()[5:] for e in errors])
     assert result[2] < result[1]
@@ -112,7 +115,7 @@ def available(arrived):
 @pytest.mark.slow
 def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy):
     steps = 5
-    arrived = hg.simulation.mesh_arrivals(lossy, "trace", steps, 2)
+    arrived = arrivals(lossy, "trace", steps, 2)
     a, q, p, h, r = models()
     n = len(a)
     # States of all steps as maps of x_0 and every w, white.
@@ -137,7 +140,7 @@ def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy)
 
 @pytest.mark.slow
 def test_no_rule_beats_the_bound(lossy):
-    arrived = hg.simulation.mesh_arrivals(lossy, "best", 12, 5)
+    arrived = arrivals(lossy, "best", 12, 5)
     bound = hg.simulation.best_possible(lossy, "best", arrived)
     for name in RULES:
         error = hg.simulation.mesh_errors(lossy, name, arrived).actual[-1]
@@ -201,9 +204,9 @@ def listed_mean(neighbours, names, steps, chance):
 @pytest.mark.slow
 def test_frozen_best_weights_claim_what_they_err():
     net = network({"m": hg.fusion.DiagonalWeights()}, link=LINK)
-    frozen = hg.simulation.freeze(net, "m", hg.simulation.mesh_arrivals(net, "m", 60, 0), last=40)
+    frozen = hg.simulation.freeze(net, "m", arrivals(net, "m", 60, 0), last=40)
     assert frozen.claims()["a"]["m"] == "nominal"
-    errors = hg.simulation.mesh_errors(frozen, "m", hg.simulation.mesh_arrivals(net, "m", 80, 9))
+    errors = hg.simulation.mesh_errors(frozen, "m", arrivals(net, "m", 80, 9))
     ratio = np.trace(errors.actual[20:], axis1=2, axis2=3).mean(0) / np.trace(
         errors.claimed[20:], axis1=2, axis2=3
     ).mean(0)
@@ -215,7 +218,7 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
     """A recording takes them for some rows at a time by native code, a run at each step by XLA."""
     net = network({"d": hg.fusion.DiagonalWeights(), "m": hg.fusion.MatrixWeights()}, link=LINK)
     for name in ("d", "m"):
-        net = hg.simulation.freeze(net, name, hg.simulation.mesh_arrivals(net, name, 6, 0), last=3)
+        net = hg.simulation.freeze(net, name, arrivals(net, name, 6, 0), last=3)
     record = hg.monte_carlo(net, 11, 1, 4)
     monkeypatch.setattr("heliograph.simulation.recorded.ROWS", 4)
     reports = {f: {n: item.values[0] for n, item in record.reports[f].items()} for f in ("d", "m")}

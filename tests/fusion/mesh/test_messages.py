@@ -9,21 +9,23 @@ from tests.fusion.mesh.worlds import NODES, PLANT, RING, models, network, sender
 
 LEVELS, AMPLITUDE, STEPS, RUNS = 401, 60.0, 20, 300
 LATE = hg.erasure(hg.model.delayed(hg.perfect(), hg.Discrete([0, 1, 2], [0.5, 0.3, 0.2]), timestamped=True), 0.8)
-ROUNDED, TIGHT = UniformQuantizer(LEVELS, AMPLITUDE), UniformQuantizer(21, 3.0)
-QUANTIZERS = {"quantized": ROUNDED, "both": ROUNDED, "tight": TIGHT, "tight and late": TIGHT}
+QUANTIZERS = {"wide": UniformQuantizer(LEVELS, AMPLITUDE), "tight": UniformQuantizer(21, 3.0)}
+CASES = [("late", "wide"), ("quantized", "wide"), ("both", "wide"), ("quantized", "tight"), ("both", "tight")]
 
 
-def late_and_quantized():
-    """The ring of four nodes with links that lose and delay, quantizers, of which two saturate often, and both."""
-    links, rule = {"late": LATE, "both": LATE, "tight and late": LATE}, EqualIntersection()
-    fused = {name: hg.Fusion("own", rule, QUANTIZERS.get(name), neighbours=RING, link=links.get(name))
-             for name in ("late", *QUANTIZERS)}  # fmt: skip
+def late_and_quantized(kind="wide"):
+    """The ring of four nodes with links that lose and delay, a quantizer, of which one saturates often, and both."""
+    quantizer = QUANTIZERS[kind]
+    fusions = {"late": (None, LATE), "quantized": (quantizer, None), "both": (quantizer, LATE)}
+    fused = {name: hg.Fusion("own", EqualIntersection(), mine, neighbours=RING, link=link)
+             for name, (mine, link) in fusions.items()}  # fmt: skip
     return hg.Network(PLANT, network({}).nodes, fused)
 
 
 @pytest.fixture(scope="module")
-def record():
-    return hg.monte_carlo(late_and_quantized(), horizon=STEPS, runs=RUNS, key=5)
+def records():
+    """Of each quantizer, by one program: its numbers are arguments."""
+    return {kind: hg.monte_carlo(late_and_quantized(kind), horizon=STEPS, runs=RUNS, key=5) for kind in QUANTIZERS}
 
 
 def by_hand(z, ages, quantizer):
@@ -72,24 +74,24 @@ def by_hand(z, ages, quantizer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["late", *QUANTIZERS])
-def test_a_run_is_that_by_hand_and_no_error_is_above_what_nothing_saturated_claims(record, name):
+@pytest.mark.parametrize(("name", "kind"), CASES, ids=["late", "quantized", "both", "tight", "tight and late"])
+def test_a_run_is_that_by_hand_and_no_error_is_above_what_nothing_saturated_claims(records, name, kind):
+    record, quantizer = records[kind], None if name == "late" else QUANTIZERS[kind]
     reports, z = record.reports[name], {node: np.asarray(record.measurements[node][0]) for node in NODES}
-    quantizer = QUANTIZERS.get(name)
 
     def ages(k, i, j):
         value = reports[NODES[i]].values[0, k, RING[NODES[i]].index(NODES[j])]
-        return None if np.isnan(value) else int(value) * ("quantized" != name != "tight")
+        return None if np.isnan(value) else int(value) * (name != "quantized")
 
     means, covariances, beyond = by_hand(z, ages, quantizer)
-    assert (beyond > 20) == (quantizer is TIGHT)
+    assert (beyond > 20) == (kind == "tight")
     for i, node in enumerate(NODES):
         estimate = record.estimates[node][name]
         assert estimate.claim == ("upper" if quantizer is None else "nominal")
         np.testing.assert_allclose(estimate.mean[0], means[:, i], rtol=0, atol=1e-9)
         np.testing.assert_allclose(estimate.covariance[0], covariances[:, i], rtol=1e-9)
         assert np.isfinite(estimate.covariance).all()
-        if quantizer is TIGHT:
+        if kind == "tight":
             continue
         # The mean over 300 runs of what has at most a chi-square's mean: 5 deviations of it are 1 + 5 sqrt(1 / 300).
         error, covariance = record.errors(node, name), np.asarray(estimate.covariance)
@@ -119,12 +121,13 @@ def test_where_a_quantizer_saturates_the_error_is_above_the_claim_which_is_nomin
 
 
 @pytest.mark.slow
-def test_a_recording_gives_what_the_run_gave(record):
-    reports = {name: {n: item.values[2] for n, item in mine.items()} for name, mine in record.reports.items()}
-    z = {node: item[2] for node, item in record.measurements.items()}
-    again = hg.run(late_and_quantized(), z, reports=reports)
-    for name in reports:
-        np.testing.assert_allclose(again.estimates["b"][name].mean, record.estimates["b"][name].mean[2], atol=1e-9)
+def test_a_recording_gives_what_the_run_gave(records):
+    for kind, record in records.items():
+        reports = {name: {n: item.values[2] for n, item in mine.items()} for name, mine in record.reports.items()}
+        z = {node: item[2] for node, item in record.measurements.items()}
+        again = hg.run(late_and_quantized(kind), z, reports=reports)
+        for name in reports:
+            np.testing.assert_allclose(again.estimates["b"][name].mean, record.estimates["b"][name].mean[2], atol=1e-9)
     reports["late"]["b"][3] = 3.0
     with pytest.raises(ValueError, match="reports of node 'b': expected ages of what arrives, from 0 to 2 steps"):
         hg.run(late_and_quantized(), z, reports=reports)

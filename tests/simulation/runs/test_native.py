@@ -1,5 +1,7 @@
 """Networks simulated by native code: what XLA gives, whoever else is simulated and however runs are dealt."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.codegen.engine import SETTING
-from heliograph.codegen.nodes import Unsupported
+from heliograph.codegen.nodes import Node, Unsupported
 from heliograph.relays.design import local_error_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.medium import medium_of
@@ -82,32 +84,48 @@ NETWORKS = {
 }
 
 
-def inputs(name: str) -> np.ndarray | None:
-    return INPUTS[:HORIZON] if name == "quantized" else None
+class Both(AbstractReducer):
+    """Trajectories and statistics of the same runs, so that XLA compiles one program for the two."""
+
+    def of_step(self, step):
+        record, sums = Trajectories().of_step(step), hg.Statistics().of_step(step)
+        return OfStep(sums=sums.sums, ever=sums.ever, collected=(record.collected, sums.collected))
+
+    def summed(self, sums, common, count):
+        return hg.Statistics().summed(sums, common, count)
+
+    def finish(self, carry, collected, network):
+        record, sums = collected
+        return Trajectories().finish((), record, network), hg.Statistics().finish(carry, sums, network)
+
+    def others(self, filtered, smoothed, claims):
+        reducers = Trajectories(), hg.Statistics()
+        return tuple(reducer.others(*both, claims) for reducer, *both in zip(reducers, filtered, smoothed, strict=True))
 
 
-def daily(*names: str) -> pytest.MarkDecorator:
-    """Every network: these each day, all others in `make check`."""
-    parts = [name if name in names else pytest.param(name, marks=pytest.mark.slow) for name in NETWORKS]
-    return pytest.mark.parametrize("networked", parts, indirect=True)
+def by(engine: str, *args: object, **kwargs: object) -> object:
+    with pytest.MonkeyPatch.context() as setting:
+        setting.setenv(SETTING, engine)
+        return hg.monte_carlo(*args, **kwargs)
 
 
-@pytest.fixture
-def networked(request: pytest.FixtureRequest) -> tuple[hg.Network, np.ndarray | None]:
-    return NETWORKS[request.param](), inputs(request.param)
+def simulated(network: hg.Network, **kwargs: object) -> tuple[tuple[object, object], ...]:
+    """Record and statistics by native code, each by a program of its own, and by XLA."""
+    record = by("native", network, HORIZON, RUNS, 5, **kwargs)
+    sums = by("native", network, HORIZON, RUNS, 5, hg.Statistics(), **kwargs)
+    return (record, sums), by("xla", network, HORIZON, RUNS, 5, Both(), **kwargs)
 
 
-def by(engine: str, monkeypatch: pytest.MonkeyPatch, *args: object, **kwargs: object) -> object:
-    monkeypatch.setenv(SETTING, engine)
-    return hg.monte_carlo(*args, **kwargs)
+@pytest.fixture(scope="module", params=NETWORKS)
+def by_engine(request: pytest.FixtureRequest) -> tuple[tuple[object, object], ...]:
+    u = INPUTS[:HORIZON] if request.param == "quantized" else None
+    return simulated(NETWORKS[request.param](), inputs=u)
 
 
 @pytest.mark.slow
-@daily("linear", "shadowed")
-def test_records_are_those_of_xla(networked, monkeypatch):
+def test_records_are_those_of_xla(by_engine):
     """Draws to the last bits, estimates to 1e-12 of what deviates from step to step."""
-    network, u = networked
-    result, expected = (by(engine, monkeypatch, network, HORIZON, RUNS, 5, inputs=u) for engine in ("native", "xla"))
+    (result, _), (expected, _) = by_engine
     np.testing.assert_allclose(result.truth, expected.truth, rtol=0, atol=1e-13 * np.abs(expected.truth).max())
     for name, z in expected.measurements.items():
         np.testing.assert_allclose(result.measurements[name], z, rtol=0, atol=1e-13 * (1 + np.nanmax(np.abs(z))))
@@ -122,12 +140,8 @@ def test_records_are_those_of_xla(networked, monkeypatch):
 
 
 @pytest.mark.slow
-@daily("with memory", "shadowed")
-def test_statistics_are_those_of_xla(networked, monkeypatch):
-    network, u = networked
-    result, expected = (
-        by(engine, monkeypatch, network, HORIZON, RUNS, 5, hg.Statistics(), u) for engine in ("native", "xla")
-    )
+def test_statistics_are_those_of_xla(by_engine):
+    (_, result), (_, expected) = by_engine
     for node, filters in expected.items():
         for name, true in filters.items():
             item = result[node][name]
@@ -140,17 +154,13 @@ def test_statistics_are_those_of_xla(networked, monkeypatch):
 
 
 @pytest.mark.slow
-def test_smoothed_estimates_are_those_of_xla(monkeypatch):
+def test_smoothed_estimates_are_those_of_xla():
     """Of nodes whose links lose nothing, and of one whose do; trajectories and their sums."""
     interval = hg.smoothing.FixedInterval()
     relay = hg.hop(hg.Rayleigh(0.8), 0.05)
     filters = {"linear": hg.linear_filter(LINEAR, POSITION, relay)}
     nodes = {"a": hg.Node(POSITION, relay, filters), "b": hg.Node(POSITION, hg.erasure(relay, 0.8), filters)}
-    network = hg.Network(LINEAR, nodes)
-    result, expected = (by(e, monkeypatch, network, HORIZON, RUNS, 5, smooth=interval) for e in ("native", "xla"))
-    sums, true_sums = (
-        by(e, monkeypatch, network, HORIZON, RUNS, 5, hg.Statistics(), smooth=interval) for e in ("native", "xla")
-    )
+    (result, sums), (expected, true_sums) = simulated(hg.Network(LINEAR, nodes), smooth=interval)
     for node in nodes:
         item, true = result.smoothed.estimates[node]["linear"], expected.smoothed.estimates[node]["linear"]
         np.testing.assert_allclose(item.mean, true.mean, rtol=0, atol=1e-12)
@@ -245,9 +255,26 @@ def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
 
 @pytest.mark.slow
 def test_keys_of_another_hash_are_simulated_by_xla():
-    network = shadowed()
+    network = hg.Network(ALONE, {"a": hg.Node(GAIN, link(), {})})
     record = hg.monte_carlo(network, 3, 2, jax.random.key(0, impl="rbg"))
     assert np.isfinite(record.truth).all()
     world = World(network.plant, medium_of(network), AllFilters(network))
     with pytest.raises(Unsupported, match="rbg"):
         native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)
+
+
+def test_of_a_program_that_is_refused_the_reason_stays_alone():
+    """A program of 200,000 operations is 100 MB, which a traceback would hold."""
+    plant = hg.Plant(lambda x, u: x / (1 + jnp.linalg.svd(jnp.outer(x, x))[1]), 0.1 * np.eye(2), np.ones(2), np.eye(2))
+    network = hg.Network(plant, {"a": hg.Node(POSITION, hg.perfect(), {})})
+    world = World(plant, medium_of(network), AllFilters(network))
+
+    def nodes():
+        gc.collect()
+        return sum(isinstance(x, Node) for x in gc.get_objects())
+
+    before = nodes()
+    for _ in range(2):
+        with pytest.raises(Unsupported, match="svd"):
+            native(world, np.zeros((3, 0)), seed_key(0), Trajectories(), 8)
+    assert nodes() == before

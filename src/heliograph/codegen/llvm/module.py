@@ -1,5 +1,7 @@
 """Functions of a compiled program as text of LLVM IR, and the layout of its numbers in memory."""
 
+import math
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
@@ -12,7 +14,7 @@ from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
-from heliograph.codegen.nodes import Buffer, Guard, Loop, Node, Store, Unsupported
+from heliograph.codegen.nodes import Buffer, Guard, Loop, Node, Store, Type, Unsupported
 from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, uses, varying
 from heliograph.codegen.rules.loops import copied
 from heliograph.codegen.rules.random_bits import hash_function
@@ -23,11 +25,31 @@ LINE = 64  # bytes: where vectors of any width may start
 
 
 class Source(NamedTuple):
-    """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop."""
+    """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop.
 
-    text: str
+    The text waits compressed, to a tenth: it is needed again only if the program turns out to be executed often.
+    """
+
+    compressed: bytes
     operations: int
     work: int
+
+    @property
+    def text(self) -> str:
+        """Return the text."""
+        return zlib.decompress(self.compressed).decode()
+
+
+class Output(NamedTuple):
+    """Type and shape of a result of one run: its buffer without the program that fills it."""
+
+    type: Type
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Return the count of numbers of one run."""
+        return math.prod(self.shape)
 
 
 class Code(NamedTuple):
@@ -41,7 +63,7 @@ class Code(NamedTuple):
     blocks: Source
     once: Source | None
     tables: list[np.ndarray]
-    outputs: list[Buffer]
+    outputs: list[Output]
     common: list[bool]
     places: list[int]  # of common outputs in the shared memory
     shared: int
@@ -149,8 +171,8 @@ def written(
         once = _source(_with_functions(_once(writer, program, pointers, in_shared), writer), writer.mine)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    source = _source(text, mine)
-    return Code(source, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, divisions)
+    source, results = _source(text, mine), [Output(b.type, b.shape) for b in outputs]
+    return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
@@ -175,7 +197,8 @@ def _source(text: str, items: Iterable[Any]) -> Source:
     """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
     counts = Counter(x.block for x in items if isinstance(x, Node))
     turns = {block: turns_of(block) for block in counts}
-    return Source(text, counts.total(), sum(count * turns[block] for block, count in counts.items()))
+    work = sum(count * turns[block] for block, count in counts.items())
+    return Source(zlib.compress(text.encode(), 1), counts.total(), work)
 
 
 def _places(

@@ -1,6 +1,7 @@
 """Rules of loops: short ones are written out; long ones stay loops with stacked results in memory, as does `while`."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -157,7 +158,10 @@ def copied(lowering: Lowering, x: InMemory) -> InMemory:
 
 
 def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower a loop that ends when no run's condition holds; a run whose condition is false keeps its carry."""
+    """Lower a loop that ends when no run's condition holds; a run whose condition is false keeps its carry.
+
+    Under `vmap` the condition has axes, the leading ones of the carry, and each entry keeps its carry likewise.
+    """
     params, graph, outer = equation.params, lowering.graph, lowering.graph.current
     conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
@@ -168,11 +172,13 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     graph.current = body
     now = _like(carry, loop.parameters)
     # The check comes before the body; there the carry is selected by each run's condition.
-    loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+    active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+    loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), scalars(active))
     body.items.append(Check(loop))
     results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
     moved = [n for x in results for n in scalars(x)]
-    loop.following = [select(graph, active, new, old) for new, old in zip(moved, loop.parameters, strict=True)]
+    going = [a for x in results for a in np.repeat(active.ravel(), len(scalars(x)) // active.size)]
+    loop.following = [select(graph, a, new, old) for a, new, old in zip(going, moved, loop.parameters, strict=True)]
     graph.current = outer
     outer.items.append(loop)
     loop.results = [graph.fresh("result", n.type, (), outer, (loop, k)) for k, n in enumerate(loop.initial)]

@@ -8,15 +8,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64, quickly_compiled
 from heliograph.numerics.linalg import times_vector
 from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 
@@ -121,10 +123,10 @@ def plan(
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
     `projection` (n, N) maps the filter's mean to the plant's states.
     """
-    return _plan(filter, array("inputs", inputs, (None, len(filter.inputs))), projection)
+    arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
+    return _plan(*arguments) if is_traced(arguments) else computed(_plan, _plan_by_xla, arguments)
 
 
-@compiled
 def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
     # Complete data of zeros: the matrices do not depend on their values.
     quiet = jnp.zeros(filter.received)
@@ -146,6 +148,9 @@ def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> Pl
         projection=projection,
         **sized(filter.claim, filter, filter.received),
     )
+
+
+_plan_by_xla = quickly_compiled(_plan)
 
 
 def followed(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:

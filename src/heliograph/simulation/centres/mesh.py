@@ -98,7 +98,7 @@ class Mesh(Module):
     senders: np.ndarray
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     nodes: tuple[str, ...] = eqx.field(static=True)
-    alpha: float | None = eqx.field(static=True)
+    alpha: np.ndarray | None
     quantizer: AbstractQuantizer | None
     needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -246,7 +246,7 @@ class Mesh(Module):
             block = None if blocks is None else blocks[rows, :width, :, :width]
             seen = Believed(covariance[theirs[:, 0]], traces[theirs], information[theirs], block, present[rows, :width])
             if self.alpha is not None:  # what was sent last errs by more than the estimate
-                wider = np.where(np.arange(width) > 0, (1 + np.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
+                wider = jnp.where(np.arange(width) > 0, (1 + jnp.sqrt(self.alpha * covariance.shape[-1])) ** 2, 1.0)
                 seen = seen._replace(traces=seen.traces * wider, information=seen.information / wider[:, None, None])
             results.append(both(bucket.rule, seen, *(leaf[rows] for leaf in rest), known))
         if len(results) == 1:
@@ -353,7 +353,7 @@ def mesh_of(network: Network, name: str) -> Mesh:
         senders=graph.senders,
         places=tuple(mine),
         nodes=graph.nodes,
-        alpha=fusion.alpha,
+        alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # a number of its program
         quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
         needs_joint=fusion.rule.needs_joint,
         claim=network.claims()[nodes[0]][name],

@@ -19,6 +19,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
+from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, Parts, mesh_of
 from heliograph.simulation.centres.mesh_check import error_claim
 from heliograph.simulation.network import Network
@@ -69,15 +70,17 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
     mesh = mesh_named(network, fusion)
     steps = check_count("horizon", horizon)
     with jax.enable_x64(True):
-        return np.asarray(_drawn(mesh, key_of(key), np.arange(steps)))
+        return np.asarray(_drawn(mesh.edges, key_of(key), np.arange(steps)))
 
 
 @quickly_compiled
-def _drawn(mesh: Mesh, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
-        return mesh.edges.draw(state, key, k)
+def _drawn(edges: Edges, key: jax.Array, steps: np.ndarray) -> jax.Array:
+    """Draw what arrives by the edges alone, so that all rules share a program."""
 
-    drawn: jax.Array = jax.lax.scan(body, mesh.edges.init(key), jnp.asarray(steps))[1]
+    def body(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
+        return edges.draw(state, key, k)
+
+    drawn: jax.Array = jax.lax.scan(body, edges.init(key), jnp.asarray(steps))[1]
     return drawn
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from heliograph.fusion.cross_covariance import Motion
 from heliograph.fusion.mesh.gains import correct
 from heliograph.fusion.quantizer import AbstractQuantizer, widen
-from heliograph.numerics.types import Bool, Float, Int
+from heliograph.numerics.types import Array, Bool, Float, Int
 
 
 class OnTheWay(NamedTuple):
@@ -43,7 +43,7 @@ class Messages(NamedTuple):
 
 
 def moved_beyond(
-    alpha: float, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
+    alpha: Array, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
     """Test which nodes send: those that are `off` by off' P^-1 off > alpha n from what somebody received last.

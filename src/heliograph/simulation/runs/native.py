@@ -123,7 +123,7 @@ def _made(
     try:
         return _program(tree, held, fixed, known)
     except Unsupported as error:
-        return error
+        return Unsupported(error.operation, error.where)  # without its traceback, which holds the program
 
 
 def _program(
@@ -162,11 +162,17 @@ def _program(
     return Accumulated(program, Summed(summed, BATCHES, numbers)), structure
 
 
+@eqx.filter_jit
+def _stepped(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+    """Step a world, traced once for worlds that differ in numbers alone, however long and whatever is collected."""
+    return world.step(state, key, row)
+
+
 def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
     """Collect the results of a run: stacked over time, but for flags that hold if true at any step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
-        state, outputs = world.step(state, key, row)
+        state, outputs = _stepped(world, state, key, row)
         return state, reducer.of_step(outputs)
 
     _, recorded = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
@@ -179,7 +185,7 @@ def _smoothed(
     """Collect the results of a run's filtered and smoothed estimates, from the whole run with its smoother steps."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        return world.step(state, key, row)
+        return _stepped(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return reduced_run(reducer, later, outputs)
