@@ -113,7 +113,7 @@ def _monomials(z: np.ndarray, order: int) -> np.ndarray:
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = exponents(len(columns), order)
-    return np.column_stack([values[:, np.repeat(columns, each)].prod(axis=1) for each in powers])
+    return np.column_stack([values[:, np.repeat(columns, exponent)].prod(axis=1) for exponent in powers])
 
 
 def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:

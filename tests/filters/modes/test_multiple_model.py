@@ -108,17 +108,17 @@ def test_a_chain_that_varies_leads_from_each_step_to_the_next():
 
 
 @pytest.fixture(scope="module")
-def many():
+def estimated():
     """Estimate and likelihood of many particles after DATA."""
     return stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE), DATA)
 
 
 @pytest.mark.slow
-def test_many_particles_are_close_to_bayes_rule(many):
+def test_many_particles_are_close_to_bayes_rule(estimated):
     """20,000 particles over six steps, 64 paths: within 4 standard errors of the mean of as many draws."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(DATA))
     mean, spread, total = exact(PLANT, SENSOR, link, DATA)
-    result, likelihood = many
+    result, likelihood = estimated
     tolerance = 4 / np.sqrt(LARGE) * np.sqrt(spread[0, 0])
     assert abs(result.mean[0] - mean[0]) < tolerance
     assert abs(result.covariance[0, 0] - spread[0, 0]) < tolerance
@@ -288,8 +288,8 @@ def test_a_count_of_particles_is_positive():
 
 
 @pytest.mark.slow
-def test_particles_depend_on_seed_and_data_alone(many):
-    once, again = many[0], stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE), DATA)[0]
+def test_particles_depend_on_seed_and_data_alone(estimated):
+    once, again = estimated[0], stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE), DATA)[0]
     np.testing.assert_array_equal(once.mean, again.mean)
     other = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE, seed=1), DATA)[0]
     assert other.mean[0] != once.mean[0]
