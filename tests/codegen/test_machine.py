@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.codegen.compiled import compile
+from heliograph.codegen import compiled
+from heliograph.codegen.compiled import Alone, compile
 from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
 from heliograph.codegen.nodes import Node
+from heliograph.codegen.program import lower
 
 STEPS = 500
 STARTS = np.random.default_rng(7).normal(size=(16, 2))
@@ -81,6 +83,18 @@ def test_prepared_code_is_not_generated_again(code):
 def test_no_code_is_generated_with_care_without_optimizations(code):
     jax.config.update("jax_disable_most_optimizations", True)
     assert code.blocks.machine(2 * OFTEN).level == 0
+
+
+def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):
+    careful = Alone(lower(rotated, STARTS[0]))
+    monkeypatch.setattr(compiled, "LONG", careful.code.operations - 1)
+    hasty = Alone(lower(rotated, STARTS[0]))
+    assert (careful.machine.level, hasty.machine.level) == (1, 0)
+    for step in (careful, hasty):
+        step.inputs[0][...] = STARTS[0]
+        step()
+    for a, b in zip(careful.outputs, hasty.outputs, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_code_lets_go_of_the_program_that_it_was_made_of():

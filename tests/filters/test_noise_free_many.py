@@ -87,10 +87,12 @@ def erasing(m):
 
 
 def linear(channel):
+    channel = cache(channel)  # one of each dimension, which has its moments computed once
     return lambda plant, sensor, m: hg.linear_filter(plant, sensor, channel(m))
 
 
 def informed(channel):
+    channel = cache(channel)
     return lambda plant, sensor, m: filters.side_information_filter(plant, sensor, channel(m))
 
 

@@ -46,23 +46,25 @@ def posterior(plant: Scalar, link: Link, delta: float, z: np.ndarray) -> tuple[n
     move = _normal(x[:, None] - a * x[None], q) * h
     noise = _normal(x[:, None] - x[None], r)  # N(r; x, R), (x, r)
     quiet = ndtr((x[None] + delta - x[:, None]) / np.sqrt(r)) - ndtr((x[None] - delta - x[:, None]) / np.sqrt(r))
-    modes, begun, last, total = len(link.loss), False, 0.0, 0.0
+    modes, begun, last, total, lost = len(link.loss), False, 0.0, 0.0, False
     atom, f = link.initial[:, None] * _normal(x, p) * h, np.zeros((modes, len(x), len(x)))
     means, variances = [], []
     for k, value in enumerate(z):
-        atom, f = np.einsum("xs,js->jx", move, atom), move @ f
-        if k:
-            atom, f = np.einsum("ij,ix->jx", link.transition, atom), np.einsum("ij,ixr->jxr", link.transition, f)
+        atom, lost = atom @ move.T, lost and bool(link.loss.any())
+        f = np.matmul(move, f) if lost else f  # zero after a value, and where nothing is ever lost
+        if k and modes > 1:
+            atom, f = link.transition.T @ atom, np.tensordot(link.transition, f, (0, 0)) if lost else f
         loss = link.loss[:, None]
         free = 1 - _share(x, last, delta, h) if begun else np.ones(len(x))  # of each cell of r, what an event leaves
         if np.isnan(value):
-            gone = loss[:, :, None] * noise * h * (_beyond(f, cells) + atom[:, :, None] * free)
+            beyond = atom[:, :, None] * free
+            gone = loss[:, :, None] * (noise * h) * (_beyond(f, cells) + beyond if lost else beyond)
             stay = ndtr((last + delta - x) / np.sqrt(r)) - ndtr((last - delta - x) / np.sqrt(r)) if begun else 0.0
-            atom, f = atom * stay, f * quiet + gone
+            atom, f, lost = atom * stay, f * quiet + gone if lost else gone, True
         else:
             event = float(abs(value - last) > delta or not begun)
             sent = event * atom + f @ (1 - _share(x, value, delta, h))
-            atom, f, last = (1 - loss) * sent * _normal(value - x, r), np.zeros_like(f), value
+            atom, f, last, lost = (1 - loss) * sent * _normal(value - x, r), np.zeros_like(f), value, False
         begun = True
         weight = atom.sum() + f.sum()
         total += np.log(weight)

@@ -8,7 +8,7 @@ from scipy.special import ndtr, ndtri
 
 
 class Problem(NamedTuple):
-    """x+ = A x + N(0, Q), y = h(x) + N(0, r), x_0 ~ N(0, P); a link of modes with a loss in each."""
+    """x+ = A x + N(0, Q), y = h(x) + N(0, r), x_0 ~ N(0, P), x (n, particles); a link of modes with a loss in each."""
 
     a: np.ndarray
     q: np.ndarray
@@ -25,41 +25,43 @@ class Problem(NamedTuple):
 def particle_moments(problem: Problem, z: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Means (steps, n) and covariances (steps, n, n) after each step of z (steps,), NaN where nothing came."""
     random, n = np.random.default_rng(seed), len(problem.a)
-    x = random.normal(size=(count, n)) @ np.linalg.cholesky(problem.p).T
+    x = np.linalg.cholesky(problem.p) @ random.standard_normal((n, count))
     factor, deviation = np.linalg.cholesky(problem.q), np.sqrt(problem.r)
     mode = np.searchsorted(np.cumsum(problem.initial)[:-1], random.random(count))
     reference, age = np.zeros(count), np.zeros(count, dtype=int)
     means, covariances = [], []
     for k, value in enumerate(z):
-        x = x @ problem.a.T + random.normal(size=(count, n)) @ factor.T
-        if k:
+        x = problem.a @ x + factor @ random.standard_normal((n, count))
+        if k and len(problem.initial) > 1:
             rows = np.cumsum(problem.transition, axis=1)[mode][:, :-1]
             mode = np.sum(random.random((count, 1)) > rows, axis=1)
         age, y = age + 1, problem.h(x)
-        loss = problem.loss[mode]
+        loss = problem.loss[mode] if len(problem.initial) > 1 else problem.loss[0]
         due = np.full(count, k == 0) if problem.heartbeat is None else (k == 0) | (age >= problem.heartbeat)
-        low = ndtr((reference - problem.delta - y) / deviation)
-        high = ndtr((y - reference - problem.delta) / deviation)
         if np.isnan(value):
+            low = ndtr((reference - problem.delta - y) / deviation)
+            high = ndtr((y - reference - problem.delta) / deviation)
             quiet = np.where(due, 0.0, 1 - low - high)
-            gone = loss * np.where(due, 1.0, low + high)
-            weight = quiet + gone
-            lost = random.random(count) * weight > quiet
+            weight = quiet + loss * np.where(due, 1.0, low + high)
             # What was lost: y outside of the interval, or anywhere where it was due.
-            share = random.random(count)
-            below = share * (low + high) < low
-            place = np.where(below, share * (low + high), 1 - (share * (low + high) - low))
-            sent = y + deviation * ndtri(np.clip(np.where(due, share, place), 1e-300, 1 - 1e-16))
-            reference, age = np.where(lost, sent, reference), np.where(lost, 0, age)
+            lost = np.flatnonzero(random.random(count) * weight > quiet)
+            low, high, share = low[lost], high[lost], random.random(len(lost))
+            within, below = share * (low + high), share * (low + high) < low
+            where = np.where(due[lost], share, np.where(below, within, 1 - (within - low)))
+            reference[lost] = y[lost] + deviation * ndtri(np.clip(where, 1e-300, 1 - 1e-16))
+            age[lost] = 0
         else:
             allowed = due | (np.abs(value - reference) > problem.delta * (1 - 1e-9))
             weight = (1 - loss) * np.exp(-((value - y) ** 2) / (2 * problem.r)) * allowed
             reference, age = np.full(count, value), np.zeros(count, dtype=int)
         weight = weight / weight.sum()
-        mean = weight @ x
-        apart = x - mean
+        mean = x @ weight
+        apart = x - mean[:, None]
         means.append(mean)
-        covariances.append((weight[:, None] * apart).T @ apart)
-        chosen = np.searchsorted(np.cumsum(weight)[:-1], (random.random() + np.arange(count)) / count)
-        x, mode, reference, age = x[chosen], mode[chosen], reference[chosen], age[chosen]
+        covariances.append(weight * apart @ apart.T)
+        # Systematic resampling: copies of each, from whole numbers between ends of shares of the unit interval.
+        ends = np.ceil(np.cumsum(weight) * count - random.random()).astype(int)
+        ends[-1] = count
+        chosen = np.repeat(np.arange(count), np.diff(ends, prepend=0))
+        x, mode, reference, age = x[:, chosen], mode[chosen], reference[chosen], age[chosen]
     return np.array(means), np.array(covariances)

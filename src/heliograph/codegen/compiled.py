@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
-from heliograph.codegen.machine import ALWAYS, Function, Machine, Tiers, features
+from heliograph.codegen.machine import ALWAYS, LONG, Function, Machine, Tiers, features
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
@@ -103,8 +103,8 @@ class Alone:
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
         self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
-        # Level 0 takes four times as long as level 1 where vectors have one lane.
-        self.machine, self.tree, self._in_place = Machine(self.code.blocks.text, level=1), program.tree, in_place
+        level = int(self.code.operations <= LONG)
+        self.machine, self.tree, self._in_place = Machine(self.code.blocks.text, level), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import computed
 from heliograph.live.later import Sweeper
 from heliograph.live.row_step import RowStep
 from heliograph.live.snapshot import Identity, network_identity
@@ -16,8 +15,8 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import quickly_compiled
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.by_name import by_name
@@ -55,43 +54,43 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
     f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
     test these around the initial mean, with all other inputs 1; s = 0 and t = 0 are among the divisions.
     """
-    with jax.enable_x64(True):
-        mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
-        # At the initial mean, and one standard deviation from it.
-        for x in (mean, mean + spread):
-            for s, t in CUTS:
-                whole, parts = _moved(plant, dt, x, (s + t,)), _moved(plant, dt, x, (s, t))
-                for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
-                    gap = float(np.abs(at_once - in_two).max())
-                    if not gap <= TOLERANCE * max(1.0, float(np.abs(at_once).max())):
-                        return (
-                            f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}; give the "
-                            "plant a function, and a noise, of dt that agree over the parts of an interval"
-                        )
+    mean, spread = np.asarray(plant.initial_mean), np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
+    cuts = np.array(CUTS)
+    # At the initial mean, and one standard deviation from it.
+    for x in (mean, mean + spread):
+        whole, parts = _moved(plant, dt, x, cuts.sum(axis=1, keepdims=True)), _moved(plant, dt, x, cuts)
+        for i, (s, t) in enumerate(CUTS):
+            for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
+                gap = float(np.abs(at_once[i] - in_two[i]).max())
+                if not gap <= TOLERANCE * max(1.0, float(np.abs(at_once[i]).max())):
+                    return (
+                        f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}; give the "
+                        "plant a function, and a noise, of dt that agree over the parts of an interval"
+                    )
     return ""
 
 
+@compiled
 def _moved(
-    plant: AbstractPlant, dt: int, x: np.ndarray, parts: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return state, Jacobian and noise covariance after these intervals."""
-    n = len(x)
-    state, matrix, spread = x, np.eye(n), np.zeros((n, n))
-    for interval in parts:
-        u = np.ones(len(plant.inputs))
-        u[dt] = interval
-        state, a, noise = computed(_over_interval, _over_interval_by_xla, (plant, state, u))
-        matrix, spread = a @ matrix, a @ spread @ a.T + noise
-    return state, matrix, spread
+    plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
+) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
+    """Return state, Jacobian and noise covariance after the parts of each cut."""
 
+    def after(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        n = len(x)
+        state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
+        for interval in parts:
+            u = jnp.ones(len(plant.inputs)).at[dt].set(interval)
+            a = jax.jacfwd(plant.transition)(state, u)
+            state, matrix, spread = (
+                plant.transition(state, u) + plant.noise_mean(),
+                a @ matrix,
+                a @ spread @ a.T + plant.noise_covariance(u),
+            )
+        return state, matrix, spread
 
-def _over_interval(plant: AbstractPlant, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return state, Jacobian and noise covariance after an interval."""
-    following = jnp.asarray(plant.transition(x, u) + plant.noise_mean())
-    return following, jax.jacfwd(plant.transition)(x, u), jnp.asarray(plant.noise_covariance(u))
-
-
-_over_interval_by_xla = quickly_compiled(_over_interval)
+    moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(after)(jnp.asarray(intervals))
+    return moved
 
 
 class JudgementAt(NamedTuple):

@@ -42,7 +42,7 @@ def test_vectors_and_ranges_agree_with_forty_thousand_particles(numbers, link, h
     record = hg.monte_carlo(network, horizon=50, runs=runs, key=3)
 
     def measure(x):
-        return x[:, 0] if moving else np.sqrt(9 + (4 + x[:, 0]) ** 2)
+        return x[0] if moving else np.sqrt(9 + (4 + x[0]) ** 2)
 
     problem = Problem(numbers["a"], numbers["q"], measure, 0.01, numbers["p"], numbers["delta"], *modes, heartbeat)
     results = [particle_moments(problem, record.measurements["a"][i, :, 0], 40_000, i) for i in range(runs)]

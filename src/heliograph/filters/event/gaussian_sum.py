@@ -22,7 +22,7 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractThreshold
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
@@ -91,7 +91,7 @@ class EventFilter(AbstractSizedFilter):
         """Always true: silence is a measurement."""
         return True
 
-    @in_float64
+    @compiled
     def init(self) -> EventBelief:
         """The prior, and no reference yet."""
         start, m = at(self.plant, 0), self.outputs

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
@@ -55,7 +56,7 @@ class ParticleFilter(AbstractSizedFilter):
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
     particles: int = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
+    seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
 
     @in_float64
     def init(self) -> Particles:
@@ -157,6 +158,6 @@ def particle_filter(
     """
     return ParticleFilter(
         particles=check_count("particles", particles),
-        seed=check_count("seed", seed, 0),
+        seed=np.asarray(check_count("seed", seed, 0)),
         **by_mode(plant, sensor, channel, transform, nodes),
     )

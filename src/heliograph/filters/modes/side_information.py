@@ -1,6 +1,7 @@
 """Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,7 @@ from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import pseudo_solve
@@ -294,20 +296,18 @@ def side_information_filter(
     check_linear("side-information filter", plant, sensor)
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
+    initial, steps, known = _described(channel)
     # P(flag | mode); one flag that is always the same where there are none.
-    steps = [joint_modes(c) for c in unstack(channel)]
-    modes = len(steps[0].initial)
-    chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
-    for i, row in enumerate(chances):
-        probabilities(f"flags in mode {i}", row)
-    described = by_pattern(steps, chances)
-    # Exact needs known probabilities, within the modes and of the chain.
-    known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
+    if flags is not None:
+        chances = array("flags", flags, (len(initial), None))
+        for i, row in enumerate(chances):
+            probabilities(f"flags in mode {i}", row)
+        steps = [replace(step, flags=chances) for step in steps]
     return SideInformationFilter(
         plant=plant,
         sensor=sensor,
-        channel=over_time(described) if isinstance(channel, OverTime) else described[0],
-        initial=steps[0].initial,
+        channel=over_time(steps) if isinstance(channel, OverTime) else steps[0],
+        initial=initial,
         flagged=flags is not None,
         **sized(
             given_bounds("exact" if known else "nominal", plant, sensor, channel),
@@ -315,6 +315,14 @@ def side_information_filter(
             first(channel).outputs + (flags is not None),
         ),
     )
+
+
+@cached
+def _described(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
+    """Law of a channel's first mode, its moments at each step, and whether all of its probabilities are known."""
+    steps = [joint_modes(c) for c in unstack(channel)]
+    known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
+    return steps[0].initial, by_pattern(steps, np.ones((len(steps[0].initial), 1))), known
 
 
 def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:

@@ -1,11 +1,12 @@
 """Innovation of a fused estimate: what arrives at the nodes, less what the predicted fused estimate expects of it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.gaussian.belief import Belief
@@ -109,7 +110,8 @@ def fused_innovations(network: Network, alike: Sequence[Alike]) -> dict[str, Fus
     if network.common is not None or network.relays is not None or network.shared:
         return tests
     places, plant = network.places(), at(network.plant, 0)
-    start = Belief(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
+    moments: Any = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)  # on no device: no program
+    start = Belief(*moments)
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":
