@@ -245,6 +245,20 @@ def test_derivatives_of_the_graph_are_those_of_the_function():
     np.testing.assert_allclose(by_graph, by_jax, rtol=1e-11, atol=1e-12)
 
 
+def test_gradients_through_a_loop_run_on_native_code():
+    """Which begin with memory that the loop fills; of x' = x a^2, whose last state is x a^(2 N)."""
+
+    def last(a, x):
+        return jax.lax.scan(lambda x, _: (x * a**2, None), x, length=300)[0]
+
+    a, x = 1 + 1e-3 * RANDOM.random(5), RANDOM.normal(size=5)
+    slopes = jax.grad(last, argnums=(0, 1))
+    assert engine_of(slopes, a, x).startswith("native")
+    by_a, by_x = hg.simulation.over_runs(slopes, a, x)
+    np.testing.assert_allclose(by_a, 600 * x * a**599, rtol=1e-12)  # 600 products, each rounded
+    np.testing.assert_allclose(by_x, a**600, rtol=1e-12)
+
+
 def test_a_user_can_ask_for_the_engine_and_force_one(monkeypatch):
     def svd(x):
         return jnp.linalg.svd(x)[1]
@@ -304,6 +318,19 @@ def test_numbers_may_be_multiplied_with_truth_values_and_integers():
     by_numpy = [(r @ (r[:, None] > np.arange(2)), (r > 0) @ r, r.astype(int) @ np.outer(r, r)) for r in x]
     for values, expected in zip(hg.simulation.over_runs(sums, x), zip(*by_numpy, strict=True), strict=True):
         np.testing.assert_allclose(values, expected, rtol=1e-14, atol=1e-15)  # fused or not: a rounding of 1
+
+
+def test_exponents_may_be_integers():
+    """Each number its own, known or of the data; also of what is negative, and one over a power."""
+
+    def powers(x, k):
+        return x[:, None] ** jnp.arange(-1, 4), x**k
+
+    x, k = RANDOM.normal(size=(5, 3)), RANDOM.integers(-2, 4, size=(5, 3))
+    assert engine_of(powers, x, k).startswith("native")
+    table, single = hg.simulation.over_runs(powers, x, k)
+    np.testing.assert_allclose(table, x[..., None] ** np.arange(-1.0, 4.0), rtol=1e-14)
+    np.testing.assert_allclose(single, x ** k.astype(float), rtol=1e-14)
 
 
 def test_the_largest_and_least_of_many_integers_and_truth_values():

@@ -15,7 +15,7 @@ from heliograph.codegen.nodes import Key, Node, Type, Unsupported
 # Operation of JAX -> the graph's.
 ELEMENTWISE = {name: name for name in (
     "add", "sub", "mul", "div", "rem", "neg", "abs", "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan",
-    "tanh", "atan2", "pow", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
+    "tanh", "atan2", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
     "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "digamma", "asin", "acos", "atan",
     "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "nextafter",
 )} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
@@ -80,6 +80,11 @@ def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
     unit = graph.constant(1.0 if type == "f64" else 1, type)
     product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
     return product if params["y"] >= 0 else graph.node("div", type, unit, product)
+
+
+def _power_of_number(graph: Graph, type: Type, params: Any, x: Node, exponent: Node) -> Node:
+    """Compute x^y, where y may be an integer beside a real x."""
+    return graph.node("pow", type, x, exponent if exponent.type == type else graph.node("convert", type, exponent))
 
 
 def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
@@ -168,6 +173,7 @@ def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: 
 RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
 RULES |= {
     "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
+    "pow": _composed(_power_of_number),
     "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
     "convert_element_type": _composed(_convert), "bitcast_convert_type": _bitcast,
     "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),

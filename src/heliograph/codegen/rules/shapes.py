@@ -72,6 +72,11 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
     return [lowering.known(np.broadcast_to(along.reshape([-1 if d == axis else 1 for d in range(len(shape))]), shape))]
 
 
+def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
+    """Memory that a loop fills, as the transpose of a scan begins with: zeros."""
+    return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
+
+
 def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Slice one axis after another, each start clamped so that the slice lies inside."""
     x = inputs[0]
@@ -145,5 +150,5 @@ RULES |= {
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
     "unstack": _unstack, "pad": _pad,
-    "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
+    "iota": _iota, "empty": _empty, "empty2": _empty, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip
