@@ -6,26 +6,31 @@ The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses u
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
-from typing import Any, NamedTuple, TypeVar
+from functools import cache, lru_cache, wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import numpy as np
 
 from heliograph.codegen.compiled import Compiled
+from heliograph.codegen.graph import MOST
 from heliograph.codegen.lowering import like
 from heliograph.codegen.machine import target
 from heliograph.codegen.nodes import Unsupported
 from heliograph.codegen.program import lower
+from heliograph.numerics import float64
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.collector import no_collector
-from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
 Code = TypeVar("Code")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 SETTING = "HELIOGRAPH_ENGINE"
 COMPILED = 256  # functions whose code is held at once
+SHORT = 8_000  # operations: native code of 11,000 takes as long to make as a program of XLA, one of a thousand a third
 ENGINES = ("native", "xla")
 
 
@@ -69,30 +74,57 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     return chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
 
 
-def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
-    """Return the code of a function of one run for arguments like these, compiled once; or why there is none."""
+def chosen(
+    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int = MOST
+) -> Choice:
+    """Return the code of a function of one run for arguments like these, compiled once; or why there is none.
+
+    XLA computes a program of more than `most` operations, unless native code is forced.
+    """
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
-    choice = _available() or _cached(function, arguments, differs)
+    choice = _available() or _cached(function, arguments, differs, MOST if engine == "native" else most)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
 
 
-def computed(function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree]) -> PyTree:
+def computed(
+    function: Callable[..., PyTree], by_xla: Callable[..., PyTree], arguments: Sequence[PyTree], most: int = MOST
+) -> PyTree:
     """Compute a function once, in double precision, as NumPy arrays: by native code where it supports the function.
 
     Args:
         function: a function of trees of arrays.
         by_xla: the same function compiled by XLA, which computes it elsewhere.
         arguments: its arguments.
+        most: operations above which XLA computes.
     """
     with jax.enable_x64(True):
-        choice = chosen(function, arguments, [False] * len(arguments))
+        choice = chosen(function, arguments, [False] * len(arguments), most)
         if choice.code is None:
-            return to_numpy(by_xla(*arguments))
+            return float64.to_numpy(by_xla(*arguments))
         return jax.tree.map(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+
+
+def compiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function that is called now and then, once per structure and shapes of its arguments.
+
+    Native code computes it if it is short, else XLA as by `float64.compiled`; both in double precision, from numbers
+    and to NumPy arrays. Inside a trace it is the plain function.
+    """
+    by_xla = float64.compiled(function)
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if kwargs or is_traced(*args):
+            return by_xla(*args, **kwargs)
+        float64.check_process()
+        returned: R = computed(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        return returned
+
+    return call
 
 
 def setting() -> str:
@@ -128,7 +160,7 @@ def _available() -> Choice | None:
     return None
 
 
-def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
+def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int) -> Choice:
     """Return code for the structure of a function and its arguments, which may be objects with arrays."""
     # Arrays become arguments; all other leaves are part of the cached key.
     leaves, form = jax.tree.flatten((function, *arguments))
@@ -142,7 +174,7 @@ def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differ
     )
     # A leaf without a hash has no key: XLA computes.
     try:
-        code, why = _made(form, kinds)
+        code, why = _made(form, kinds, most)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -160,7 +192,7 @@ class _Array(NamedTuple):
 
 @lru_cache(COMPILED)
 @no_collector()
-def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
+def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
     arrays = [k for k in kinds if isinstance(k, _Array)]
 
@@ -171,7 +203,7 @@ def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
         return function(*arguments)
 
     try:
-        program = lower(call, *(like(k.shape, k.dtype) for k in arrays))
+        program = lower(call, *(like(k.shape, k.dtype) for k in arrays), most=most)
         return Compiled(program, [k.differs for k in arrays]), ""
     except Unsupported as error:
         return None, str(error)

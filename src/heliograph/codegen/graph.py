@@ -14,9 +14,10 @@ MOST = 400_000  # nodes made, constants and what is dropped again among them
 
 
 class Graph:
-    """A program under construction. Nodes are made in `current`, the innermost open block."""
+    """A program under construction, of `most` nodes. Nodes are made in `current`, the innermost open block."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MOST) -> None:
+        self.most = most
         self.top = Block(None)
         self.current = self.top
         self.serial = 0
@@ -46,8 +47,8 @@ class Graph:
     def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
         """Make a node that equals no other, and that no block contains yet."""
         self.serial += 1
-        if self.serial > MOST:
-            raise Unsupported(f"a program of more than {MOST} operations")
+        if self.serial > self.most:
+            raise Unsupported(f"a program of more than {self.most} operations")
         return Node(op, type, args, block, value, self.serial)
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:

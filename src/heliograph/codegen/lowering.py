@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
-from heliograph.codegen.graph import Graph
+from heliograph.codegen.graph import MOST, Graph
 from heliograph.codegen.memory import LONG, InMemory
 from heliograph.codegen.nodes import TYPES, Buffer, Key, Node, Type, Unsupported
 from heliograph.numerics.types import PyTree
@@ -27,8 +27,8 @@ IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in me
 class Lowering:
     """Lowering of operations one after another into a graph."""
 
-    def __init__(self) -> None:
-        self.graph = Graph()
+    def __init__(self, most: int = MOST) -> None:
+        self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen.graph import Graph
+from heliograph.codegen.graph import MOST, Graph
 from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.nodes import Block, Buffer, Guard, Loop, Node, Store
@@ -43,14 +43,14 @@ class Program(NamedTuple):
     tree: Any
 
 
-def lower(function: Callable[..., PyTree], *examples: PyTree) -> Program:
-    """Lower a function of one run, for arguments of these shapes."""
-    return lower_traced(*traced(function, *examples))
+def lower(function: Callable[..., PyTree], *examples: PyTree, most: int = MOST) -> Program:
+    """Lower a function of one run, for arguments of these shapes, to at most so many operations."""
+    return lower_traced(*traced(function, *examples), most)
 
 
-def lower_traced(traced: ClosedJaxpr, tree: Any) -> Program:
+def lower_traced(traced: ClosedJaxpr, tree: Any, most: int = MOST) -> Program:
     """Lower a program that is traced already."""
-    lowering = Lowering()
+    lowering = Lowering(most)
     avals: list[Any] = [v.aval for v in traced.jaxpr.invars]
     inputs, values = [], []
     for aval in avals:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.rows import Filtered, filtered
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -17,7 +18,7 @@ from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown, unmasked
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.fusion.intersection import (
     equal_shares,
     intersect,
@@ -26,7 +27,6 @@ from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 

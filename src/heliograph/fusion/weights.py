@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.fusion.intersection import inverse
 from heliograph.numerics.check import array, fail, probabilities, shown
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import add, diagonal_of, identity, psd_solve, rounding, solve, symmetric, symmetrize
 from heliograph.numerics.over_runs import runs_last

@@ -231,7 +231,7 @@ def _can_smooth(filter: AbstractFilter) -> bool:
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:
         with jax.enable_x64(True):
-            state = jax.tree.map(jnp.asarray, filter.init())
+            state = jax.tree.map(np.asarray, filter.init())
             eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
     except InputError:
         return False

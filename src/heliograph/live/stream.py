@@ -4,7 +4,6 @@ from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
@@ -170,7 +169,7 @@ class _Placed:
             self.values = filter.received - filter.trigger.side_information(filter.outputs)
         with jax.enable_x64(True):
             self.numbers, self._static = cast(filter)
-            self._start: PyTree = jax.tree.map(jnp.asarray, filter.init())
+            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
         self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter.claim))
 

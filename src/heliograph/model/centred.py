@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.model.channel import Channel, amplify_and_forward
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps

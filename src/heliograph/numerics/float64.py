@@ -131,7 +131,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         check_process()
         with jax.enable_x64(True):
-            arrays: R = to_numpy(jitted(*jax.tree.map(_as_array, args), **jax.tree.map(_as_array, kwargs)))
+            arrays: R = to_numpy(jitted(*jax.tree.map(as_array, args), **jax.tree.map(as_array, kwargs)))
         return arrays
 
     return call
@@ -141,7 +141,8 @@ def _traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _as_array(leaf: object) -> object:
+def as_array(leaf: object) -> object:
+    """Return a number as an array, which compiled code takes as an argument; anything else as it is."""
     value = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
     if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":
         raise fail("argument", "numbers that a double can hold", shown(leaf))

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.disk.quoting import visible
@@ -136,7 +135,7 @@ def _relied_on(network: Network) -> dict[str, set[str]]:
 def weighs(filter: AbstractFilter) -> bool:
     """Ask whether a filter weighs the components of what arrives."""
     with jax.enable_x64(True):
-        state = jax.tree.map(jnp.asarray, filter.init())
+        state = jax.tree.map(np.asarray, filter.init())
         innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
     return innovation.weight is not None
 

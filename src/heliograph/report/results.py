@@ -79,6 +79,7 @@ def _write(results: Results, folder: Path) -> None:
 
     pictures = {name: svg(figure) for name, figure in results.figures.items()}
     for name, figure in results.figures.items():
+        figure.set_layout_engine("none")  # it is laid out
         (folder / f"{name}.png").write_bytes(png(figure))
         (folder / f"{name}.svg").write_bytes(pictures[name])
     (folder / "report.html").write_text(results.page(pictures).html(), encoding="utf-8")

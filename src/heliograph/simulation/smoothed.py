@@ -152,7 +152,7 @@ def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) 
 def _smoothed_claim(filter: AbstractFilter) -> Claim:
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
-        state = jax.tree.map(jnp.asarray, filter.init())
+        state = jax.tree.map(np.asarray, filter.init())
         _, step = eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
     claim: Claim = step.claim
     return claim

@@ -344,7 +344,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     return CentreFilter(
         filters=AllFilters(alone),
         links=uplinks.links,
-        rows=uplinks.rows,
+        rows=tuple(uplinks.rows.tolist()),
         ages=uplinks.delay.shape[1],
         widest=max(uplinks.received),
         quantized=uplinks.quantizers is not None,

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_count, instance
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float
 from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag

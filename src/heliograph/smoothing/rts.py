@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.backward_pass import planned_with_past, quiet_steps, stepped

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.learning.description import Description, describe
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, array, fail, instance, items, table
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import same
 from heliograph.numerics.types import Array, Float
 from heliograph.planning.descent import Evaluation, Problem

@@ -35,7 +35,7 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, stack,
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.erasure import arrived
@@ -330,12 +330,12 @@ class CentreFilter(AbstractSizedFilter):
 
     filters: NodesFilters
     links: Links | OverTime
-    rows: np.ndarray
+    rows: tuple[int, ...] = eqx.field(static=True)
     ages: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)
     quantized: bool = eqx.field(static=True)
 
-    @in_float64
+    @compiled
     def init(self) -> CentreBelief:
         """Return the state before any report."""
         states, _, _, known, *_ = self.filters.init()
@@ -354,10 +354,10 @@ class CentreFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: CentreBelief, z: ArrayLike, k: Step = 0) -> tuple[CentreBelief, Innovation]:
         """Correct with the reports that arrived."""
-        nodes = state.known.past.gain.shape[1]
-        everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[self.rows].set(jnp.asarray(z))
+        nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
+        everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
         known, expected = receive_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
-        mean, covariance = expected.mean[self.rows], expected.covariance[self.rows][:, self.rows]
+        mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 
     @in_float64

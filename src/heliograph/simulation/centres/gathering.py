@@ -108,7 +108,7 @@ class Reporting(Module):
         means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
         flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
         flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
-        known, estimate = self.centre.step(known, jnp.ravel(reports)[self.centre.rows], u, k)
+        known, estimate = self.centre.step(known, jnp.ravel(reports)[np.array(self.centre.rows)], u, k)
         return (flying, known), estimate, traffic, (sent, drawn.delay)
 
 

@@ -18,7 +18,7 @@ from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.simulation.centres.centre import Apart, observation_model
@@ -27,6 +27,8 @@ from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
 from heliograph.simulation.centres.messages import OnTheWay, quantized
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
+
+_quantized = compiled(quantized)  # each message of a service: one program, not twenty
 
 
 class NodeState(NamedTuple):
@@ -86,8 +88,8 @@ class NodeFilter(AbstractSizedFilter):
     @in_float64
     def sent(self, before: MeshState) -> tuple[jax.Array, jax.Array]:
         """Mean (n,) and covariance (n, n) in a message about the estimate before a step, quantized where it is."""
-        message = jnp.asarray(before.mean)[0], jnp.asarray(before.covariance)[0]
-        return message if self.quantizer is None else quantized(self.quantizer, *message)
+        message = before.mean[0], before.covariance[0]
+        return message if self.quantizer is None else _quantized(self.quantizer, *message)
 
     def _parts(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Measurements of node and neighbours, and their estimates, of mean NaN where none came."""

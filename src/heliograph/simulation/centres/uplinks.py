@@ -156,8 +156,9 @@ class Uplinks(Module):
         A value that saturates a quantizer becomes an infinite number: nothing is known of it, and the estimate shows
         that.
         """
-        # Only every d-th step sends.
-        sending = jnp.asarray((k + 1) % self.every == 0)[:, None]
+        # Only every d-th step sends; a quotient of multiples is exact, and native code has no remainder by a variable.
+        step = jnp.asarray(k + 1, means.dtype)
+        sending = (jnp.floor(step / self.every) * self.every == step)[:, None]
         values, traffic = jnp.where(sending, means, jnp.nan), {}
         beyond = jnp.zeros(len(means), dtype=bool)
         # Quantized reports; an infinite number stands for one that saturated.

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -150,20 +151,25 @@ def correlated_mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return mean, float(np.sqrt(max(sum(terms), 0.0)) / count)
 
 
-@compiled
 def innovations_of(
     filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
     NaN where it did not arrive, or the components before it determine it.
     """
+    likelihoods, white = computed(_innovations, _by_xla, (filter, z, u))
+    return likelihoods, white
 
+
+def _innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
     def single(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = ~jnp.isnan(innovation.value)
         covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
         white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
         return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)
 
-    likelihoods, white = over_rows(filter, z, u, single)
-    return likelihoods, white
+    return over_rows(filter, z, u, single)
+
+
+_by_xla = quickly_compiled(_innovations)
