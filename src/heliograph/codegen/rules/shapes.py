@@ -150,5 +150,6 @@ RULES |= {
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
     "unstack": _unstack, "pad": _pad,
-    "iota": _iota, "empty": _empty, "empty2": _empty, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
+    "iota": _iota, "empty": _empty, "empty2": _empty,
+    "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip
