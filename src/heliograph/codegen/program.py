@@ -5,6 +5,7 @@ that W consecutive runs of a block never wrap around; what is beyond the end is 
 """
 
 from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -151,56 +152,51 @@ def uses(node: Any) -> list[Node]:
 
 def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any]:
     """Return nodes, buffers, loops and guards that differ between runs if these input buffers do."""
+    following: dict[Any, list[Any]] = {}
+
+    @cache
+    def around(block: Block) -> list[Any]:
+        return [b.owner for b in block.inwards() if b.owner is not None]
+
+    for item in needed(roots):
+        for source in _sources(item, around):
+            following.setdefault(source, []).append(item)
+        if isinstance(item, Store):  # a store makes its buffer differ
+            following.setdefault(item, []).append(item.buffer.owner[0])
     results: set[Any] = set(inputs)
-    items = sorted(needed(roots), key=_order)
-    count = -1
-    while count != len(results):
-        count = len(results)
-        results.update(node for node in items if node not in results and _varies(node, results))
+    left = list(results)
+    while left:
+        for item in following.get(left.pop(), ()):
+            if item not in results:
+                results.add(item)
+                left.append(item)
     return results
 
 
-def _order(node: Any) -> int:
-    return node.serial if isinstance(node, Node) else 0
-
-
-def _varies(node: Any, results: set[Any]) -> bool:
-    if isinstance(node, Node) and not results.isdisjoint(node.args):
-        return True
-    if isinstance(node, Buffer):
-        owner = node.owner[0]
-        if owner is not node:
-            return owner in results
-        return any(store.node in results or _is_apart(store.block, results) for store in node.stores)
-    # Statements: a loop differs by its condition, a store makes its buffer differ.
-    if isinstance(node, Loop):
-        return node.length is None and (node.condition in results or any(p in results for p in node.parameters))
-    if isinstance(node, Guard):
-        return node.condition in results
-    if isinstance(node, Store):
-        if node.node in results or _is_apart(node.block, results):
-            results.add(node.buffer.owner[0])
-            return True
-        return False
+def _sources(item: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
+    """Return those of which one that differs between runs makes an item differ: arguments, memory, loops around it."""
+    if isinstance(item, Buffer):
+        owner = item.owner[0]
+        return [owner] if owner is not item else [x for store in item.stores for x in _sources(store, around)]
+    # Statements: a loop differs by its condition.
+    if isinstance(item, Loop):
+        return [item.condition, *item.parameters] if item.length is None else []
+    if isinstance(item, Guard):
+        return [item.condition]
+    if isinstance(item, Store):
+        return [item.node, *around(item.block)]
     # Nodes: by their block, by memory, by the carry, else by their arguments.
-    if node.op in ("constant", "counter"):
-        return False
-    if _is_apart(node.block, results):
-        return True
-    if node.op == "load":
-        return node.value[0].owner[0] in results
-    if node.op in ("parameter", "result"):
-        loop, index = node.value
-        return loop in results or loop.initial[index] in results or loop.following[index] in results
-    if node.op == "guarded":
-        guard, index = node.value
-        return guard in results or guard.values[index] in results
-    return False
-
-
-def _is_apart(block: Block, results: set[Any]) -> bool:
-    """Return whether a block lies in a loop or guard that differs between runs."""
-    return any(b.owner in results for b in block.inwards() if b.owner is not None)
+    if item.op in ("constant", "counter"):
+        return list(item.args)
+    if item.op == "load":
+        return [*item.args, *around(item.block), item.value[0].owner[0]]
+    if item.op in ("parameter", "result"):
+        loop, index = item.value
+        return [*item.args, *around(item.block), loop, loop.initial[index], loop.following[index]]
+    if item.op == "guarded":
+        guard, index = item.value
+        return [*item.args, *around(item.block), guard, guard.values[index]]
+    return [*item.args, *around(item.block)]
 
 
 class Summed(NamedTuple):
