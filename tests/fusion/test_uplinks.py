@@ -89,6 +89,13 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
 
 
 @pytest.mark.slow
+def test_every_second_step_sends(record):
+    for report in record.reports["second"].values():
+        values = np.asarray(report.values)
+        assert np.isnan(values[:, ::2]).all() and np.isfinite(values[:, 1::2]).all()
+
+
+@pytest.mark.slow
 def test_monte_carlo_agrees(record):
     """Mean squares within three standard errors of each run's own claim; the quantized one's is above."""
     for name, estimate in record.estimates["fused"].items():

@@ -14,6 +14,7 @@ PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.
 SCALAR = Scalar(0.98, 0.04, 0.01, 1.0)
 LOSSY = hg.erasure(hg.perfect(), 0.8)
 BURSTS = hg.gilbert_elliott(hg.erasure(hg.perfect(), 1.0), hg.erasure(hg.perfect(), 0.0), 0.05, 0.2)
+FEW = {"known": 2, "lost": 1}  # Gaussians of a sum, joined at each step as the 3 and 2 of one by default are
 IN_BURSTS = Link(np.array([[0.95, 0.05], [0.2, 0.8]]), np.array([0.8, 0.2]), np.array([0.0, 1.0]))
 
 
@@ -164,13 +165,13 @@ def test_the_stochastic_trigger_claims_exactly_only_where_the_posterior_is_a_gau
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "trigger",
-    [hg.SendOnDelta(0.6, heartbeat=4), hg.SendOnPredictionError(0.5), hg.StochasticTrigger(2.0), hg.Periodic(3, 1),
-     hg.SendOnDelta(0.6, reference="acknowledged")],
-    ids=lambda trigger: type(trigger).__name__,
+    ("trigger", "sizes"),
+    [(hg.SendOnDelta(0.6, heartbeat=4), {}), (hg.SendOnPredictionError(0.5), FEW), (hg.StochasticTrigger(2.0), {}),
+     (hg.Periodic(3, 1), {}), (hg.SendOnDelta(0.6, reference="acknowledged"), FEW)],
+    ids=["delta", "prediction error", "stochastic", "periodic", "acknowledged"],
 )  # fmt: skip
-def test_every_rule_gives_a_filter_of_the_contract(trigger):
-    item = hg.event_filter(PLANT, SENSOR, LOSSY, trigger)
+def test_every_rule_gives_a_filter_of_the_contract(trigger, sizes):
+    item = hg.event_filter(PLANT, SENSOR, LOSSY, trigger, **sizes)
     result = follow(item, [0.4])
     assert np.isfinite(result.innovation.log_likelihood) and np.isfinite(result.covariance)
     check_filter(item)

@@ -169,18 +169,19 @@ def test_every_transform_serves_a_nonlinear_sensor(transform):
     np.testing.assert_allclose(state.mean, other.mean, atol=2e-6)
 
 
+def over(item, rows):
+    """States of a filter after each row of one run."""
+
+    def step(state, row):
+        after, _ = item.correct(item.predict(state), row)
+        return after, after
+
+    return jax.lax.scan(step, jax.tree.map(jax.numpy.asarray, item.init()), rows)[1]
+
+
 def judged(item, truth, z, first=50):
     """Error of the place and NEES of all states over runs."""
-
-    def over(rows):
-        def step(state, row):
-            after, _ = item.correct(item.predict(state), row)
-            return after, after
-
-        return jax.lax.scan(step, item.init(), rows)[1]
-
-    with jax.enable_x64(True):
-        result = jax.tree.map(np.asarray, jax.jit(jax.vmap(over))(z))
+    result = hg.simulation.over_runs(jax.tree_util.Partial(over, item), z)
     e = (truth - result.mean)[:, first:]
     nees = np.einsum("rti,rtij,rtj->rt", e, np.linalg.inv(result.covariance[:, first:]), e).mean() / e.shape[-1]
     return np.sqrt(np.mean(np.sum(e[..., :2] ** 2, axis=-1))), nees

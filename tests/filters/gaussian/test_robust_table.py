@@ -54,18 +54,21 @@ def filters_of(column):
     }
 
 
+def run(item, rows):
+    """Means and covariances of a filter over the rows of one run."""
+
+    def step(state, row):
+        state, _ = item.correct(item.predict(state, (), row[1]), row[0], row[1])
+        estimate = item.estimate(state)
+        return state, (jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
+
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, item.init()), (rows, jnp.arange(STEPS)))[1]
+
+
 def judged(item, truth, z):
-    """Mean squared error of the place and NEES per dimension of each run, (runs,) each."""
-
-    def run(rows):
-        def step(state, row):
-            state, _ = item.correct(item.predict(state, (), row[1]), row[0], row[1])
-            estimate = item.estimate(state)
-            return state, (jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance))
-
-        return jax.lax.scan(step, jax.tree.map(jnp.asarray, item.init()), (rows, jnp.arange(STEPS)))[1]
-
-    mean, covariance = (np.asarray(x)[:, FIRST:] for x in hg.simulation.over_runs(run, z))
+    """Mean squared error of the place and NEES per dimension of each run, (runs,) each; a program for each rule."""
+    one_run = jax.tree_util.Partial(run, item)
+    mean, covariance = (np.asarray(x)[:, FIRST:] for x in hg.simulation.over_runs(one_run, z))
     error = truth[:, FIRST:] - mean
     nees = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=-1)
     return np.sum(error[..., :2] ** 2, axis=-1).mean(axis=1), nees.mean(axis=1) / 4
