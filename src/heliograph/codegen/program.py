@@ -158,45 +158,45 @@ def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any
     def around(block: Block) -> list[Any]:
         return [b.owner for b in block.inwards() if b.owner is not None]
 
-    for item in needed(roots):
-        for source in _sources(item, around):
-            following.setdefault(source, []).append(item)
-        if isinstance(item, Store):  # a store makes its buffer differ
-            following.setdefault(item, []).append(item.buffer.owner[0])
+    for node in needed(roots):
+        for source in _sources(node, around):
+            following.setdefault(source, []).append(node)
+        if isinstance(node, Store):  # a store makes its buffer differ
+            following.setdefault(node, []).append(node.buffer.owner[0])
     results: set[Any] = set(inputs)
     left = list(results)
     while left:
-        for item in following.get(left.pop(), ()):
-            if item not in results:
-                results.add(item)
-                left.append(item)
+        for node in following.get(left.pop(), ()):
+            if node not in results:
+                results.add(node)
+                left.append(node)
     return results
 
 
-def _sources(item: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
-    """Return those of which one that differs between runs makes an item differ: arguments, memory, loops around it."""
-    if isinstance(item, Buffer):
-        owner = item.owner[0]
-        return [owner] if owner is not item else [x for store in item.stores for x in _sources(store, around)]
+def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
+    """Return those of which one that differs between runs makes a number or statement differ: arguments, memory, loops around it."""
+    if isinstance(node, Buffer):
+        owner = node.owner[0]
+        return [owner] if owner is not node else [x for store in node.stores for x in _sources(store, around)]
     # Statements: a loop differs by its condition.
-    if isinstance(item, Loop):
-        return [item.condition, *item.parameters] if item.length is None else []
-    if isinstance(item, Guard):
-        return [item.condition]
-    if isinstance(item, Store):
-        return [item.node, *around(item.block)]
+    if isinstance(node, Loop):
+        return [node.condition, *node.parameters] if node.length is None else []
+    if isinstance(node, Guard):
+        return [node.condition]
+    if isinstance(node, Store):
+        return [node.node, *around(node.block)]
     # Nodes: by their block, by memory, by the carry, else by their arguments.
-    if item.op in ("constant", "counter"):
-        return list(item.args)
-    if item.op == "load":
-        return [*item.args, *around(item.block), item.value[0].owner[0]]
-    if item.op in ("parameter", "result"):
-        loop, index = item.value
-        return [*item.args, *around(item.block), loop, loop.initial[index], loop.following[index]]
-    if item.op == "guarded":
-        guard, index = item.value
-        return [*item.args, *around(item.block), guard, guard.values[index]]
-    return [*item.args, *around(item.block)]
+    if node.op in ("constant", "counter"):
+        return list(node.args)
+    if node.op == "load":
+        return [*node.args, *around(node.block), node.value[0].owner[0]]
+    if node.op in ("parameter", "result"):
+        loop, index = node.value
+        return [*node.args, *around(node.block), loop, loop.initial[index], loop.following[index]]
+    if node.op == "guarded":
+        guard, index = node.value
+        return [*node.args, *around(node.block), guard, guard.values[index]]
+    return [*node.args, *around(node.block)]
 
 
 class Summed(NamedTuple):
