@@ -350,7 +350,7 @@ def test_noise_counts_next_to_a_precise_output():
         order = [1, 0] if swap else [0, 1]
         rows, variances = rows[order], variances[np.ix_(order, order)]
         with jax.enable_x64(True):
-            gain, after = precise_update(np.array([[prior]]), rows, variances, np.zeros(2))
+            gain, after = jax.jit(precise_update)(np.array([[prior]]), rows, variances, np.zeros(2))
         k, h = [Fraction(float(x)) for x in gain[0]], [Fraction(float(x)) for x in rows[:, 0]]
         left = 1 - sum(a * b for a, b in zip(k, h, strict=True))
         of_noise = sum(a * a * Fraction(float(v)) for a, v in zip(k, np.diag(variances), strict=True))
@@ -379,8 +379,6 @@ def test_outputs_that_say_the_same_of_a_tied_state_say_it_once():
     ties, seen = 10.0 ** rng.uniform(-4, 4, size=(2, 300)), 10.0 ** rng.uniform(-4, 4, size=(2, 300))
     prior, output = ties[:, None] * ties[None], np.stack([np.zeros((2, 300)), seen], axis=1)
     with jax.enable_x64(True):
-        gain, _ = precise_update(
-            *map(jnp.asarray, (prior, output, np.zeros_like(prior), (1e-14 * seen * ties[1]) ** 2))
-        )
+        gain, _ = jax.jit(precise_update)(prior, output, np.zeros_like(prior), (1e-14 * seen * ties[1]) ** 2)
     moved = np.max(np.abs(np.asarray(gain) * seen), axis=1)
     assert np.max(np.abs(moved / (ties / ties[1]) - 1)) < 1e-6
