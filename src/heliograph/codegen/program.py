@@ -174,7 +174,7 @@ def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any
 
 
 def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
-    """Return those of which one that differs between runs makes a number or statement differ: arguments, memory, loops around it."""
+    """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
     if isinstance(node, Buffer):
         owner = node.owner[0]
         return [owner] if owner is not node else [x for store in node.stores for x in _sources(store, around)]
