@@ -5,6 +5,7 @@ that W consecutive runs of a block never wrap around; what is beyond the end is 
 """
 
 from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -151,56 +152,51 @@ def uses(node: Any) -> list[Node]:
 
 def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any]:
     """Return nodes, buffers, loops and guards that differ between runs if these input buffers do."""
+    following: dict[Any, list[Any]] = {}
+
+    @cache
+    def around(block: Block) -> list[Any]:
+        return [b.owner for b in block.inwards() if b.owner is not None]
+
+    for node in needed(roots):
+        for source in _sources(node, around):
+            following.setdefault(source, []).append(node)
+        if isinstance(node, Store):  # a store makes its buffer differ
+            following.setdefault(node, []).append(node.buffer.owner[0])
     results: set[Any] = set(inputs)
-    items = sorted(needed(roots), key=_order)
-    count = -1
-    while count != len(results):
-        count = len(results)
-        results.update(node for node in items if node not in results and _varies(node, results))
+    left = list(results)
+    while left:
+        for node in following.get(left.pop(), ()):
+            if node not in results:
+                results.add(node)
+                left.append(node)
     return results
 
 
-def _order(node: Any) -> int:
-    return node.serial if isinstance(node, Node) else 0
-
-
-def _varies(node: Any, results: set[Any]) -> bool:
-    if isinstance(node, Node) and not results.isdisjoint(node.args):
-        return True
+def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
+    """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
     if isinstance(node, Buffer):
         owner = node.owner[0]
-        if owner is not node:
-            return owner in results
-        return any(store.node in results or _is_apart(store.block, results) for store in node.stores)
-    # Statements: a loop differs by its condition, a store makes its buffer differ.
+        return [owner] if owner is not node else [x for store in node.stores for x in _sources(store, around)]
+    # Statements: a loop differs by its condition.
     if isinstance(node, Loop):
-        return node.length is None and (node.condition in results or any(p in results for p in node.parameters))
+        return [node.condition, *node.parameters] if node.length is None else []
     if isinstance(node, Guard):
-        return node.condition in results
+        return [node.condition]
     if isinstance(node, Store):
-        if node.node in results or _is_apart(node.block, results):
-            results.add(node.buffer.owner[0])
-            return True
-        return False
+        return [node.node, *around(node.block)]
     # Nodes: by their block, by memory, by the carry, else by their arguments.
     if node.op in ("constant", "counter"):
-        return False
-    if _is_apart(node.block, results):
-        return True
+        return list(node.args)
     if node.op == "load":
-        return node.value[0].owner[0] in results
+        return [*node.args, *around(node.block), node.value[0].owner[0]]
     if node.op in ("parameter", "result"):
         loop, index = node.value
-        return loop in results or loop.initial[index] in results or loop.following[index] in results
+        return [*node.args, *around(node.block), loop, loop.initial[index], loop.following[index]]
     if node.op == "guarded":
         guard, index = node.value
-        return guard in results or guard.values[index] in results
-    return False
-
-
-def _is_apart(block: Block, results: set[Any]) -> bool:
-    """Return whether a block lies in a loop or guard that differs between runs."""
-    return any(b.owner in results for b in block.inwards() if b.owner is not None)
+        return [*node.args, *around(node.block), guard, guard.values[index]]
+    return [*node.args, *around(node.block)]
 
 
 class Summed(NamedTuple):
