@@ -83,7 +83,7 @@ def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _power_of_number(graph: Graph, type: Type, params: Any, x: Node, exponent: Node) -> Node:
-    """Compute x^y, where y may be an integer beside a real x."""
+    """Compute x^y of a real x, of an integer y too."""
     return graph.node("pow", type, x, exponent if exponent.type == type else graph.node("convert", type, exponent))
 
 
