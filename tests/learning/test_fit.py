@@ -179,3 +179,21 @@ def test_a_ridge_is_said_before_the_data():
 def test_recordings_that_cannot_be_learned_from(build, data, message):
     with pytest.raises(ValueError, match=message):
         hg.fit(build, data, INPUTS)
+
+
+@pytest.mark.slow
+def test_a_value_of_a_noise_with_two_values_is_learned():
+    """Its powers, 0 to 2, are moments of a noise that depends on what is searched for."""
+
+    def network_of(value):
+        noise = hg.random_affine.FiniteSupport([[value], [-0.2]], [0.3, 0.7])
+        plant = hg.LinearPlant([[0.9]], 0.2, [0.0], 1.0)
+        return hg.Network(plant, {"a": hg.Node(hg.LinearSensor([[1.0]], 0.1), hg.hop(1.0, noise), {})})
+
+    z = hg.monte_carlo(network_of(2.0), STEPS, 1, key=1).measurements["a"][0]
+    fitted = hg.fit(lambda: network_of(hg.free(0.5, "value")), {"a": z})
+    (row,) = fitted.rows()
+    assert row.low <= 2.0 <= row.high and row.high - row.low < 0.5
+    node = fitted.network.nodes["a"]
+    by_filter = hg.log_likelihood(hg.linear_filter(fitted.network.plant, node.sensor, node.channel), z)
+    np.testing.assert_allclose(fitted.log_likelihood["linear"], by_filter, rtol=1e-10)  # 400 terms of order 1
