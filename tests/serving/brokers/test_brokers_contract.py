@@ -107,6 +107,10 @@ def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: st
         transport = make(at(server, kind, f"out{kind}"))
         if isinstance(transport, Nats):
             assert await silent(transport)
+        elif isinstance(transport, Mqtt):  # what is provisional is lost until there is a connection
+            async with asyncio.timeout(30):
+                while not transport._writer.client.is_connected():
+                    await asyncio.sleep(0.01)
         result = await observe(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
         assert result == [b"now", *[output.body for output in outputs]]
         if isinstance(transport, Nats):
