@@ -71,7 +71,6 @@ def test_a_skewed_sensor_with_a_bias():
         assert item["rmse"] == pytest.approx(np.hypot(item["claimed of level"], item["claimed of leak"]), rel=0.05)
 
 
-@pytest.mark.slow
 def test_a_drone_with_range_bearing_stations_over_a_lossy_relay():
     """A drone circles two ground stations that measure its distance and bearing; a relay forwards their packets, adds a
     little noise and loses one in five. Where is the drone, also when the bearing jumps from pi to -pi?"""

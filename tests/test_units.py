@@ -51,7 +51,6 @@ RULES = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES, ids=lambda r: type(r).__name__)
 def test_fusion_in_very_different_units(rule):
     p = np.diag([1e6, 1e-9])
@@ -100,7 +99,6 @@ def test_behind_a_silent_channel_a_filter_predicts(name, channel):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_noise_free_hops_and_a_position_known_exactly(name):
     twice = hg.LinearSensor([[1.0], [1.0]], 0.0)

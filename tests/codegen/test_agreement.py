@@ -90,7 +90,6 @@ def test_filters_of_more_states_than_xla_writes_out(name):
     assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cubature", "imm"])
 def test_bits_depend_on_no_width_and_no_neighbour(name):
     """Of one run alone, of 13 in blocks of 8, 4 and 16, by one core and by several."""
@@ -218,7 +217,6 @@ def test_special_numbers_are_what_jax_makes_of_them(function):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
-@pytest.mark.slow
 def test_random_draws_are_those_of_jax():
     def draw(number):
         key = jax.random.fold_in(jax.random.key(3), number)

@@ -57,7 +57,6 @@ def test_operations_give_the_numbers_of_jax(function):
 ROWS = jnp.array([0, 0, 2])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

@@ -57,7 +57,6 @@ def test_seconds_between_dates_lose_nothing():
 ACROSS_WINTER_TIME = ["2026-10-25T02:59:58+02:00", "2026-10-25T02:59:59+02:00", "2026-10-25T02:00:00+01:00"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
 def test_dates_pass_through_a_run(tmp_path, ending):
     (tmp_path / "in.csv").write_text("time,pos\n" + "".join(f"{t},{i}\n" for i, t in enumerate(ACROSS_WINTER_TIME)))

@@ -42,7 +42,6 @@ def test_header_and_log_times_are_both_there(world):
     assert arrivals == sorted(arrivals) and "/picture (20)" in table.notes[0]
 
 
-@pytest.mark.slow
 def test_rows_are_what_a_timeline_puts_in_order(world):
     """With a window that nothing misses, the final estimates are those of the rows in the order of measuring."""
     network, sources, _, path = world
@@ -107,7 +106,6 @@ def test_a_bag_that_is_damaged(world, tmp_path):
     assert table.broken.endswith("what was read before it stays")
 
 
-@pytest.mark.slow
 def test_a_bag_that_was_cut_off_is_read_up_to_there(world, tmp_path):
     """A chunk is 1 MiB: of two and a half the first two are whole, and their events are those of the whole bag."""
     network, sources, *_ = world

@@ -114,7 +114,6 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
         np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
-@pytest.mark.slow
 def test_what_is_smoothed_is_turned_too(east_and_west):
     """Sweeps never wrap: the cut is at no angle; what they tell is between -pi and pi. To rounding of 30 steps."""
     results = [record.smoothed for record in east_and_west]
@@ -126,7 +125,6 @@ def test_what_is_smoothed_is_turned_too(east_and_west):
             assert np.all(np.abs(other[:, 2]) <= np.pi)
 
 
-@pytest.mark.slow
 def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_where_something_does(east_and_west):
     east, west = east_and_west
     worst = []
@@ -141,7 +139,6 @@ def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_wher
     assert worst[0] < 1e-9 and worst[1] > 3  # metres
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["without the cut", "across the cut"])
 def test_filters_are_consistent_across_the_cut_as_elsewhere(side):
     outcome = hg.monte_carlo(network(side), STEPS, 2000, 0, keep=hg.Statistics(), inputs=U)
@@ -168,7 +165,6 @@ MAKERS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     """Five turns: what is received without its turns gives what is received with them, likelihoods too."""
@@ -190,7 +186,6 @@ def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     assert item.claim == "nominal"  # a circle is no line: P grows beyond it
 
 
-@pytest.mark.slow
 def test_an_unknown_heading_is_no_smaller_than_known():
     """Points that lie more than half a turn apart still tell how a compass is correlated with the heading."""
     plant, sensor = turning(True)
@@ -201,7 +196,6 @@ def test_an_unknown_heading_is_no_smaller_than_known():
     assert abs(nearest(np.asarray(estimate.mean), np.array([-3.0, 0.0]), (0,))[0] + 3.0) < 0.01
 
 
-@pytest.mark.slow
 def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
     mean = np.array([[3.1, 1.0], [-3.1, 2.0]])
     two = [hg.model.Estimate(m, np.eye(2), "nominal") for m in mean]
@@ -250,7 +244,6 @@ def test_what_a_full_turn_changes_is_no_circle():
         hg.cubature_filter(plant, hg.LinearSensor([[1.0]], 1.0), hg.perfect())
 
 
-@pytest.mark.slow
 def test_a_plant_says_how_states_differ():
     plant = robot(1.0)
     x, other = np.array([[1.0, 2.0, 3.1]]), np.array([[0.0, 0.0, -3.1]])
@@ -258,7 +251,6 @@ def test_a_plant_says_how_states_differ():
     np.testing.assert_allclose(plant.near(x, other), [[1.0, 2.0, 3.1 - 2 * np.pi]])
 
 
-@pytest.mark.slow
 def test_simulated_errors_are_around_the_circle():
     """Truth and signals are given between -pi and pi, and x - xhat is the error, whoever subtracts."""
     plant, sensor = turning(True)

@@ -32,7 +32,6 @@ def test_modes_of_any_kinds_are_those_of_the_filter_that_takes_flags(name):
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("make", [mode_known_filter, mode_late_filter])
 def test_its_covariance_is_its_error_where_modes_are_of_two_kinds(make):
     """e'P^-1e is 1 on average over 4,000 runs: within 4.5 of its standard errors at each of 20 steps."""

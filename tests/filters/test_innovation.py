@@ -60,7 +60,6 @@ def test_a_silent_channel_says_nothing():
     assert received.value[0] == 0 and received.covariance[0, 0] == 0 and received.log_likelihood == 0
 
 
-@pytest.mark.slow
 def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
     """S of the first step by the law of total variance: E[g^2] Var y + Var(g) (E y)^2 + noise."""
     plant, sensor = hg.LinearPlant([[0.5]], 0.2, [3.0], 1.0), hg.LinearSensor([[2.0]], 0.1)
@@ -75,7 +74,6 @@ def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
         assert received.value[0] == pytest.approx(2.0 - gain.moment(1) * mean, rel=ROUNDING)
 
 
-@pytest.mark.slow
 def test_a_step_computes_an_innovation_only_on_request():
     plant, sensor = hg.LinearPlant(0.9 * np.eye(2), 0.1, [1.0, 0.0], 1.0), hg.LinearSensor(np.eye(2), 0.1)
     item = hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2))

@@ -49,7 +49,6 @@ def in_runs(rng, shares, length=3, steps=1000):
     return Weighed(rng.standard_normal(down.shape), np.ones(down.shape), np.where(down, 0.1, 1.0))
 
 
-@pytest.mark.slow
 def test_outliers_in_runs_are_one_event_each():
     """Intervals of the share cover in 95 % at least, counting rows as independent in 75 %; the innocent go free.
 

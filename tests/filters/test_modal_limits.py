@@ -11,7 +11,6 @@ from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, v
 STEPS = 200  # after which no variance changes any more
 
 
-@pytest.mark.slow
 def test_fading_in_bursts():
     """P_1, P_2, P_10, P_inf to the digits given."""
     result = variances(PLANT, SENSOR, bursts(), STEPS)[[0, 1, 9, -1], 0]
@@ -60,7 +59,6 @@ def test_limits(name):
     np.testing.assert_allclose(item, other, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_estimates_do_not_depend_on_the_order_of_modes_and_hold_in_simulation():
     """The claimed variance lies within four standard errors of the measured one at each of the last steps."""
     channel = hg.gilbert_elliott(hg.hop(1.0, 0.05), hg.hop(0.2, 0.05), 0.03, 0.05)
@@ -73,7 +71,6 @@ def test_estimates_do_not_depend_on_the_order_of_modes_and_hold_in_simulation():
     assert np.all(np.abs(squares.mean(axis=0) - claimed) < 4 * squares.std(axis=0) / np.sqrt(4000))
 
 
-@pytest.mark.slow
 def test_what_does_not_arrive_is_left_out():
     item = hg.linear_filter(PLANT, SENSOR, bursts())
     state = item.predict(item.init())

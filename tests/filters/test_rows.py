@@ -19,7 +19,6 @@ Z, U = RNG.normal(size=(20, 2)), RNG.normal(size=(20, 1))
 Z[[3, 4, 4, 9], [0, 0, 1, 1]] = np.nan
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("item", [hg.kalman_filter(PLANT, SENSOR), hg.linear_filter(PLANT, SENSOR, RELAY)])
 def test_it_is_the_steps_of_the_filter(item):
     by_rows, by_steps = item.run(Z, U), follow(item, Z, U)

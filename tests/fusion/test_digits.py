@@ -31,7 +31,6 @@ def test_how_far_the_means_are_from_zero_makes_no_difference(rule):
     assert np.allclose(fused(far).mean - far, fused(0.0).mean, rtol=0, atol=2e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES_THAT_INTERSECT[:3], ids=lambda rule: type(rule).__name__)
 def test_what_is_left_by_rounding_is_known(rule):
     """Two estimates that know one combination to rounding: the limit is the intersection along the other direction.

@@ -41,7 +41,6 @@ def test_the_gap_of_the_weights_is_certified(seed, shape):
     assert np.all(weights >= 0) and weights.sum() == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.slow
 def test_weights_agree_with_slsqp():
     bounds = np.stack([covariances(seed, 4, 5) for seed in range(20)])
     reference = oracle.trace_weights(bounds)

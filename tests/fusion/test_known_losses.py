@@ -54,7 +54,6 @@ def net():
     return hg.Network(PLANT, nodes, {name: hg.Fusion("local", rule) for name, rule in rules.items()})
 
 
-@pytest.mark.slow
 def test_every_pattern_of_losses_has_its_own_covariance(net):
     """All 64 patterns of three steps and two nodes: 1e-8 of the stacked problem, and so the mean over patterns.
 

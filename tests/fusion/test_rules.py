@@ -45,7 +45,6 @@ def test_weighted_fusion_by_hand():
     assert fused.covariance[0, 0] == 2.5 and fused.claim == "upper"
 
 
-@pytest.mark.slow
 def test_estimates_that_claim_no_covariance():
     """A weighted mean needs none; rules that weigh by covariances say so."""
     some = estimates(covariances(0, 2, 2), "exact")
@@ -59,7 +58,6 @@ def test_estimates_that_claim_no_covariance():
     assert [weakest([a, "none"]) for a in STRENGTH] == ["none"] * 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "rule", [hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
 )
@@ -145,7 +143,6 @@ def test_a_fused_claim_is_never_stronger_than_its_weakest_input():
     assert hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), estimates(bounds, "exact")).claim == "nominal"
 
 
-@pytest.mark.slow
 def test_leading_axes_are_carried_along():
     bounds = np.stack([covariances(s, 3, 2) for s in range(4)])
     together = hg.fusion.fuse(hg.fusion.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))

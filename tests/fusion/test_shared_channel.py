@@ -60,7 +60,6 @@ def by_hand(steps):
     return joint
 
 
-@pytest.mark.slow
 def test_cross_covariances_of_what_is_shared():
     cross = hg.simulation.cross_covariances(shared_network({}), "local", 15)
     np.testing.assert_allclose(cross.joint, by_hand(15), rtol=1e-9, atol=1e-12)
@@ -69,7 +68,6 @@ def test_cross_covariances_of_what_is_shared():
     np.testing.assert_allclose(hg.simulation.fused_covariances(net, 15)["matrix"][-1], covariance, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_monte_carlo_agrees():
     """The claims within three standard errors; as if nothing but the plant were shared they would be off by more."""
     rules = {"matrix": hg.fusion.MatrixWeights(), "all": hg.fusion.AllReports()}

@@ -31,7 +31,6 @@ def gain(rule, given):
     return values
 
 
-@pytest.mark.slow
 def test_it_is_above_whatever_the_unknown_parts_have_in_common():
     """Unknown parts that are all one source, turned at random, and independent ones: 200 ways, none above the claim."""
     known, unknown = parts(0)
@@ -63,7 +62,6 @@ def test_with_all_known_it_is_matrix_weights_and_with_nothing_known_intersection
     assert np.trace(nothing.covariance) == pytest.approx(np.trace(intersected.covariance), rel=1e-3)
 
 
-@pytest.mark.slow
 def test_what_is_no_split_is_refused():
     known, unknown = parts(3)
     rule = hg.fusion.SplitIntersection(known)

@@ -87,7 +87,6 @@ def test_the_papers_growth_constant_is_false_and_the_certificate_is_refused(monk
     ).refuted  # |f(x)| <= .7 |x| alone is true
 
 
-@pytest.mark.slow
 def test_true_constants_give_a_level_that_is_certified():
     """|f| <= .7 |x| everywhere; .8 bounds every slope over the visited box, so the level may be called certified."""
     system = node(0, growth=(0.7, 0.8))

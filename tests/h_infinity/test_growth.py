@@ -18,7 +18,6 @@ REFUTED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUTED)
 def test_local_evidence_refutes(name):
     function, constant, text = REFUTED[name]

@@ -79,7 +79,6 @@ def test_a_system_known_by_growth_alone(size):
     np.testing.assert_allclose(design(size), design(1.0), rtol=1e-4)
 
 
-@pytest.mark.slow
 def test_the_start_is_the_largest_allowed_also_where_x_and_e_are_weighed_together():
     weight = np.array([[5.0, 3.0], [3.0, 4.0]])
     of = hg.h_infinity.growth_system(
@@ -94,7 +93,6 @@ def test_the_start_is_the_largest_allowed_also_where_x_and_e_are_weighed_togethe
     assert certify_level(of, recursive.gains, recursive.weights, recursive.multipliers, recursive.level).certified
 
 
-@pytest.mark.slow
 def test_noise_counts_in_the_units_of_each_output():
     """The noise of an output in units 1e8 times larger is none to the rounding of the others."""
 

@@ -66,7 +66,6 @@ def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
     assert result.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.slow
 def test_what_is_learned_covers_the_truth(result):
     assert result.converged
     for row in result.rows():
@@ -110,7 +109,6 @@ def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(
         result.rows("wald")
 
 
-@pytest.mark.slow
 def test_a_profile_ends_where_the_likelihood_has_fallen(result, monkeypatch):
     """At the end of an interval, with all others at their best, l is lower by half the 95 % point of chi-square."""
     linear, profile = result.solutions[0], Solution._profile

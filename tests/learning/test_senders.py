@@ -42,7 +42,6 @@ def test_the_likelihood_of_heartbeats_is_largest_at_the_true_one():
     assert total[5] > total[4] + 5 and total[5] > total[6] + 5
 
 
-@pytest.mark.slow
 def test_without_loss_delta_is_at_most_the_smallest_jump():
     """A larger one forbids that jump: a floor of 1e-6 instead of a density, 13 nats."""
     z = recording(hg.SendOnDelta(0.6), hg.perfect(), 200)

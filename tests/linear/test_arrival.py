@@ -15,7 +15,6 @@ def sensor(matrix, noise=2.5):
     return hg.LinearSensor(matrix, noise * np.eye(len(matrix)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("matrix", "output", "lower", "upper"),
     [
@@ -31,7 +30,6 @@ def test_published_examples(matrix, output, lower, upper):
     np.testing.assert_allclose(result[:2], (lower, upper), atol=5e-7)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_one_output_needs_the_product_of_all_unstable_eigenvalues(seed):
     """With one output the certificate's threshold is 1 - prod |unstable eigenvalues|^-2."""
@@ -58,7 +56,6 @@ def test_a_stable_plant_needs_nothing():
     assert result[:2] == (0.0, 0.0)
 
 
-@pytest.mark.slow
 def test_no_process_or_sensor_noise_changes_no_threshold():
     quiet = hg.LinearPlant([[1.25, 0.0], [1.0, 1.1]], np.zeros((2, 2)), np.zeros(2), np.eye(2))
     result = hg.linear.critical_arrival(quiet, sensor([[1.0, 1.0]], 0.0))

@@ -94,7 +94,6 @@ def test_a_plant_that_changes_with_the_mode():
     hg.testing.check_filter(item, steps=4)
 
 
-@pytest.mark.slow
 def test_without_modes_of_the_plant_it_is_the_linear_filter():
     move = GainAndNoise(Constant(1.0), PLANT.matrix, PLANT.noise)
     observed = Series([GainAndNoise(Constant(1.0), SENSOR.matrix, SENSOR.noise), bursts()])

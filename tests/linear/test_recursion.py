@@ -29,7 +29,6 @@ def test_scalar_recursion_by_hand():
     np.testing.assert_allclose(schedule.gains.gain[:, 0, 0], expected, rtol=1e-14)  # R = 1: the gain is P
 
 
-@pytest.mark.slow
 def test_slow_covariance_is_not_taken_for_its_limit():
     """a = 1 - 1e-5, begun 4e-10 above the limit: 100 steps change 8e-13 of it, and 5000 steps fifty times as much."""
     a, r, horizon = 1 - 1e-5, 1e6, 5000
@@ -87,7 +86,6 @@ def test_true_error_of_wrong_gains_counts_bias_and_spread():
     assert result[0, 0, 0] == pytest.approx(expected, rel=1e-14)
 
 
-@pytest.mark.slow
 def test_linear_degree_is_the_linear_filter_of_the_library():
     s = model(EXAMPLE, 10)
     other, z = hg.linear_filter(*s), np.random.default_rng(0).normal(size=(10, 1))

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 import heliograph as hg
 
 
-@pytest.mark.slow
 @given(st.integers(1, 3), st.integers(1, 2), st.floats(0.1, 1.1), st.integers(0, 1000))
 def test_it_is_the_limit_of_the_recursion(n, m, radius, seed):
     rng = np.random.default_rng(seed)

@@ -24,7 +24,6 @@ def network():
     return network_of(drifting())
 
 
-@pytest.mark.slow
 def test_a_push_replays_its_row_and_those_after_it(network, monkeypatch):
     timeline, stepped = hg.Timeline(network, 100.0), []
     pool = timeline._fleet.pool
@@ -83,7 +82,6 @@ REFUSED = [
 ]
 
 
-@pytest.mark.slow
 def test_what_is_no_event_is_said_in_one_line_and_changes_nothing(network, monkeypatch):
     timeline = hg.Timeline(network, 5.0)
     timeline.push("a", 0, 1.0, 1.0)

@@ -67,7 +67,6 @@ def limited():
     return hg.Network(PLANT, {"a": node}), hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(2), {"f": item})})
 
 
-@pytest.mark.slow
 def test_values_beyond_limits_count_as_not_arrived():
     network, free = limited()
     z = np.array([[0.3, 0.2], [6.0, 0.1], [-999, -999], [0.2, 0.4], [0.1, -999]])

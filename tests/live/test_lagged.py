@@ -45,7 +45,6 @@ def test_in_steps_it_is_the_smoother_of_the_rows():
     assert timeline.save() == before
 
 
-@pytest.mark.slow
 def test_in_continuous_time_it_is_the_conditional_law():
     """Brownian motion x from a random start, Cov(x_s, x_t) = P0 + q min(s, t), measured with noise R at odd moments."""
     start, q, r = 2.0, 0.3, 0.1

@@ -102,7 +102,6 @@ def test_losses_in_a_row_by_modes():
     assert chain(link).in_a_row(4, 2) == pytest.approx(0.2 * (0.2 + 0.8 * 0.75**4))
 
 
-@pytest.mark.slow
 def test_a_trigger_in_continuous_time_and_no_trigger_are_refused_in_one_line():
     plant = hg.Plant(lambda x, u: x, 0.1, [0.0], 1.0, inputs=["dt"])
     node = hg.Node(SENSOR, hg.perfect(), {}, trigger=hg.SendOnDelta(1.0))

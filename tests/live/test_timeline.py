@@ -126,7 +126,6 @@ def _plant(data):
     return json.loads(data[HEAD.size : end]), data[end:]
 
 
-@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_any_order_within_the_window_and_everything_twice(world, seed):
@@ -143,7 +142,6 @@ def test_any_order_within_the_window_and_everything_twice(world, seed):
     assert_same_bits(once, in_order(network, results, once.now))
 
 
-@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_what_comes_in_order_is_used_however_late(world, seed):

@@ -77,7 +77,6 @@ def test_claims_are_exact(result: dict[str, dict[str, hg.Statistics]], name: str
     assert np.max(np.abs(s.actual() - s.claimed()) / error) < Z_LIMIT
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "sent"), [("plain", 1.0), ("trajectory", 0.0)])
 def test_the_error_is_that_of_the_power_that_is_sent(
     result: dict[str, dict[str, hg.Statistics]], name: str, sent: float
@@ -124,7 +123,6 @@ def test_angles_stay_angles() -> None:
         hg.cubature_filter(plant, compass, centred(hg.hop(GAIN, 0.1), 0.4))
 
 
-@pytest.mark.slow
 def test_bad_references_are_one_clear_line() -> None:
     with pytest.raises(ValueError, match=r"reference: expected shape \(1\), got shape \(2,\)"):
         centred(RELAYED, [1.0, 2.0])

@@ -103,7 +103,6 @@ def test_units_do_not_matter():
     hg.testing.check_scaling(hg.Network(PUSHED, {"a": node}), inputs=DT[:5])
 
 
-@pytest.mark.slow
 def test_it_takes_events_at_any_time_where_a_constant_plant_names_it():
     """The step is the time since the event before; a plant without one counts whole steps, and says what to do."""
     kalman = hg.kalman_filter(PLANT, SENSOR)

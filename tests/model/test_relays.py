@@ -73,7 +73,6 @@ def test_a_link_over_time_is_read_at_the_step():
     np.testing.assert_allclose(gain, [0.1, 0.0, 0.3, 0.0], rtol=1e-15)
 
 
-@pytest.mark.slow
 def test_a_network_without_noise_has_the_limits_design_and_one_that_diverges_is_named():
     def designed(noise, growth=0.9, steps=3):
         sensor, plant = LinearSensor([[1.0]], [[noise]]), LinearPlant([[growth]], [[noise]], [1.0], [[1.0]])
@@ -87,7 +86,6 @@ def test_a_network_without_noise_has_the_limits_design_and_one_that_diverges_is_
         designed(1.0, 1e200, 4)
 
 
-@pytest.mark.slow
 def test_schedules_are_saved_and_read_back(tmp_path):
     net = unusual()
     schedules = relay_schedules(net, local_error_design(net, 6))

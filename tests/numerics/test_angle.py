@@ -56,7 +56,6 @@ def test_an_angle_that_follows_another_has_exact_moments_however_wide(rule, devi
     np.testing.assert_allclose(result.cross, covariance @ slope.T, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_a_bearing_across_the_cut_is_the_one_away_from_it_turned():
     def bearing(x):
         return jnp.stack([jnp.arctan2(x[1], x[0])])

@@ -94,7 +94,6 @@ class Compiled:
         self.source = source
 
 
-@pytest.mark.slow
 def test_what_is_made_of_an_object_is_shared_while_somebody_holds_it():
     make, source = shared(Compiled), Holder(1.0)
     made = make(source)

@@ -45,7 +45,6 @@ def test_solve(n):
         np.testing.assert_allclose(psd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 10])
 def test_a_component_known_exactly_leaves_the_derivatives_of_the_others(n):
     """A = diag(B(p), 0): the factor is that of B, and so is its derivative, though the root has none at 0."""

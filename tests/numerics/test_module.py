@@ -4,7 +4,6 @@ from types import MethodType
 
 import jax
 import jax.numpy as jnp
-import pytest
 
 import heliograph as hg
 from heliograph.numerics.module import Module
@@ -26,7 +25,6 @@ def test_methods_are_bound_as_python_does():
         assert type(method) is MethodType
 
 
-@pytest.mark.slow
 def test_they_can_be_transformed_all_the_same():
     """Bound or as an argument, the arrays of a module are traced."""
     single = Scaled(jnp.array([2.0, 3.0]))

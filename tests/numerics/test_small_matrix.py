@@ -24,7 +24,6 @@ def nested(function, *args):
         return np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(*args))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 4, UNROLL_LIMIT + 2])
 def test_nested_maps_give_what_the_library_gives(n):
     a, b = psd(RUNS, NODES, n, n), np.random.default_rng(2).normal(size=(RUNS, NODES, n, 2))
@@ -44,7 +43,6 @@ def test_a_product_broadcasts_what_is_not_mapped(inner):
     np.testing.assert_allclose(over_nodes, a @ b[:, 0], atol=ROUNDING * inner)
 
 
-@pytest.mark.slow
 def test_both_kinds_of_derivatives_pass_through():
     a, b = psd(3, 3), np.ones((3, 1))
 

@@ -24,7 +24,6 @@ def test_power_is_that_of_what_is_left() -> None:
         assert result == pytest.approx({"a.hop1": sent, "a.hop2": 1.04 * sent + 0.1}, rel=1e-10)
 
 
-@pytest.mark.slow
 def test_a_design_of_what_is_left_is_the_filter_that_runs() -> None:
     """The steady error of a design is that of its network's filter, and centring buys the most of it."""
     errors = []

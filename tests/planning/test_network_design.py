@@ -130,7 +130,6 @@ def test_one_node_with_parallel_chains_is_the_same(single):
     assert list(result.powers)[1] == "all.part2.hop1"
 
 
-@pytest.mark.slow
 def test_the_designed_network_claims_the_designed_error(single):
     result = hg.design(single, budget=10)
     steady = steady_covariance(result.network.fused["best"])
@@ -169,7 +168,6 @@ def test_an_unobserved_loss_is_fading(single):
     assert hg.design(network, budget=1).present == pytest.approx(np.trace(steady), rel=1e-9)
 
 
-@pytest.mark.slow
 def test_a_wire_passes_on_what_its_sensor_measures(single):
     wired = hg.Node(hg.LinearSensor(ROWS[2:3], NOISES[2]), hg.perfect(), {})
     network = hg.Network(single.plant, {"wired": wired, "a": single.nodes["a"]})

@@ -99,7 +99,6 @@ def test_a_nonlinear_plant_is_drawn():
         hg.power(network(hg.hop(FADING, 0.3), plant))
 
 
-@pytest.mark.slow
 def test_relays_that_filter_send_what_their_design_says():
     hop = hg.hop(FADING, 0.3)
     slots = [

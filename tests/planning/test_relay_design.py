@@ -33,7 +33,6 @@ def test_gains_are_those_of_the_tuning_within_the_budget(relays, design):
     assert design.certificate.words == "best of the one start; no bound is known"
 
 
-@pytest.mark.slow
 def test_the_network_it_gives_sends_and_errs_as_designed(design):
     sent = hg.power(design.network)
     for name in ("north", "south"):
@@ -55,7 +54,6 @@ def test_what_relays_that_filter_do_not_take_is_named(relays):
             hg.design(relays, **given)
 
 
-@pytest.mark.slow
 def test_a_network_of_relays_that_filter_is_refused(design):
     with pytest.raises(ValueError, match="network: expected a RelayNetwork alone"):
         hg.design(design.network, budget=1)

@@ -78,7 +78,6 @@ def test_the_parts_of_an_erasure():
     assert mean.erases and mean.base.law.moment(1) == 1.0 and mean.arrival == 0.7
 
 
-@pytest.mark.slow
 def test_a_filter_of_the_channel_inside_is_exact_behind_known_losses():
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     sensor, inside = hg.LinearSensor([[1.0]], 0.05), hg.hop(1.2, 0.1)

@@ -25,7 +25,6 @@ def test_moments_are_integrals_of_the_density(name, order):
     assert ours.moment(order) == pytest.approx(value, rel=1e-7)  # quad's own accuracy
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_samples_follow_the_distribution_function(name):
     ours, density = CONTINUOUS[name]

@@ -47,7 +47,6 @@ def test_draws_have_the_moments_and_the_memory_that_they_state(name):
     check_random_affine(CHANNELS[name])
 
 
-@pytest.mark.slow
 def test_the_square_of_a_link():
     check_random_affine(hg.random_affine.square(link()), highest=2)
 
@@ -64,7 +63,6 @@ class _Stays(hg.random_affine.MarkovChain):
         return state
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [_Forgets, _Stays])
 def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
     """Of the chain whose memory is right, "at rest" above, it finds nothing."""
@@ -98,7 +96,6 @@ def test_a_map_that_forgets_has_one_mode():
     assert joint.maps == (GOOD,) and joint.transition.tolist() == [[1.0]] and joint.initial.tolist() == [1.0]
 
 
-@pytest.mark.slow
 def test_a_users_map_needs_no_code_for_modes():
     class Doubled(hg.random_affine.AbstractRandomAffine):
         inside: hg.random_affine.AbstractRandomAffine

@@ -15,7 +15,6 @@ from heliograph_studies.quadratic_bias.setting import TABLE_1
 SKEWED = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 
 
-@pytest.mark.slow
 def test_independent_and_shaped_noises_are_what_they_sample():
     joint = hg.random_affine.Independent([SKEWED, hg.Gaussian([[0.5, 0.2], [0.2, 0.3]], [0.1, -0.2])])
     check_random_affine(hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), np.ones((3, 1)), joint))

@@ -45,7 +45,6 @@ def test_what_never_happens_is_left_out():
     assert only.arrived.all()
 
 
-@pytest.mark.slow
 def test_what_cannot_be_said_is_refused():
     mixed = hg.random_affine.Mixture([HALF, hg.perfect()], [0.5, 0.5])
     with pytest.raises(ValueError, match="channel with erasures: expected erasures in series and stacks, got Mixture"):

@@ -62,7 +62,6 @@ def test_the_best_receiver_behind_given_relays(local):
     assert relative(long.gains.covariance[-2:], behind) < 1e-9
 
 
-@pytest.mark.slow
 def test_without_relays_it_is_the_linear_filter():
     full = example()
     direct = full.slots[1]["relay_1"]["sensor"]
@@ -106,7 +105,6 @@ def test_a_plant_without_noise_comes_to_rest():
     assert all(np.all(covariance == 0) for covariance in design.covariance.values())
 
 
-@pytest.mark.slow
 def test_relays_that_receive_only_each_other_learn_nothing():
     """Their innovations are zero, computed from large numbers: what rounding leaves of them is no information."""
     plant = LinearPlant([[0.5, 0.4], [-0.3, 0.6]], [[0.3, 0.1], [0.1, 0.2]], np.zeros(2), np.eye(2))

@@ -60,7 +60,6 @@ def test_slots_in_turn_are_the_same_as_listed_slots():
     assert relative(local_error_design(example(), 20).moments, listed.moments) < TOLERANCE
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.0, 0.2])
 def test_a_network_of_another_kind_agrees_with_raw_moments(scale):
     """Three relays, full duplex, self-interference, direct and dependent links, noise means; greedy or other gains."""
@@ -201,7 +200,6 @@ def test_all_moments_times_nine():
     assert max(np.abs(a.gains[f] - b.gains[f]).max() for f in a.gains) < TOLERANCE
 
 
-@pytest.mark.slow
 def test_a_receiver_that_copies_its_relay():
     """Psi = I, gamma_4 = gamma_5 = 1, L = Gam: P+ = Gam (X_j + O) Gam' + Q."""
     p = oracle.random_problem(4, horizon=10, n=2, m=2)

@@ -37,7 +37,6 @@ def test_consistency_is_a_running_mean() -> None:
     np.testing.assert_allclose([drawn[0], drawn[20], drawn[-1]], [1.0, 2.5, 4.0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (1.0, 1.01, 50.0)])
 def test_labels_keep_their_order_and_do_not_meet(values: tuple[float, ...]) -> None:
     axes = consistency_over_time(TIME, two_curves(np.geomspace(0.1, 100, 50)), window=5).axes[0]

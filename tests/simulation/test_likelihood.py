@@ -38,7 +38,6 @@ def stacked():
     return np.concatenate(means), read @ joint @ read.T + np.kron(np.eye(STEPS), R)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("holes", [False, True])
 def test_it_is_the_density_of_all_measurements_together(holes):
     z, (mean, covariance) = data(holes), stacked()

@@ -213,7 +213,6 @@ def test_saturation_is_reported_and_nothing_is_claimed_there(record):
     assert 1 < record.uplinks["escape"].symbols_per_value() < 5
 
 
-@pytest.mark.slow
 def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
     some = [hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk) for chunk in (64, 256)]
     for name in ("outer", "covariance", "nees", "count"):
@@ -230,7 +229,6 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
         np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
-@pytest.mark.slow
 def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
     result = statistics["fused"]["over time"]

@@ -45,7 +45,6 @@ def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
                 np.testing.assert_allclose(known.covariance[run], alone.covariance, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
 def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     result = record.smoothed.estimates
     parts = [result[node]["linear"] for node in GAPS.names]
@@ -69,7 +68,6 @@ def test_statistics_of_the_record_and_its_smoothed_part(record):
             assert both[1].rmse()[0] < 0.97 * both[0].rmse()[0]
 
 
-@pytest.mark.slow
 def test_in_bounded_memory_with_gains_known_before_data():
     smooth = hg.smoothing.FixedInterval()
     statistics = hg.monte_carlo(WHOLE, HORIZON, 4 * RUNS, 3, keep=hg.Statistics(), smooth=smooth)
@@ -94,7 +92,6 @@ def test_a_smoothed_estimate_that_is_no_number_is_a_failure_of_its_record(record
     assert replace(record, smoothed=smoothed).failures() == expected
 
 
-@pytest.mark.slow
 def test_a_recording_is_smoothed_from_a_fixed_point_on():
     z = np.sin(np.arange(HORIZON))
     result = hg.run(WHOLE, {"node": z}, time=np.arange(HORIZON) / 10, smooth=hg.smoothing.FixedPoint(4)).smoothed
@@ -105,7 +102,6 @@ def test_a_recording_is_smoothed_from_a_fixed_point_on():
     np.testing.assert_allclose(result.estimates["node"]["linear"].mean, alone.mean, rtol=0, atol=1e-13)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_smoothed_is_refused_in_one_line():
     particle = hg.filters.particle_filter(PLANT, SENSOR, FADING, particles=10)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, FADING, {"one": particle})})

@@ -80,7 +80,6 @@ def test_a_truth_that_does_not_fit_is_refused():
         hg.run(NETWORK, {"a": np.zeros(4)}, truth=np.zeros((3, 2)))
 
 
-@pytest.mark.slow
 def test_the_report_shows_the_errors():
     single = hg.simulate(NETWORK, 40, 3)
     record = hg.run(NETWORK, single.measurements, truth=single.truth)

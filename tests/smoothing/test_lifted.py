@@ -112,7 +112,6 @@ def test_a_receiver_behind_relays_smooths_the_relays_states_too():
         hg.smoothing.smoother_steps(schedule, z)
 
 
-@pytest.mark.slow
 def test_a_bound_holds_under_every_law_where_the_mean_gain_is_known():
     plant, sensor, time = hg.LinearPlant([[0.9]], 0.2, [1.0], 0.5), hg.LinearSensor([[1.0]], 0.1), 6
     quiet, loud = hg.hop(1.0, 0.05), hg.hop(1.0, 0.8)

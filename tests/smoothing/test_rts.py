@@ -12,7 +12,6 @@ Z = np.random.default_rng(5).normal(size=25)
 Z[[4, 11]] = np.nan
 
 
-@pytest.mark.slow
 def test_it_is_the_textbooks_pass_back():
     item = hg.kalman_filter(PLANT, SENSOR)
     forward, result = item.run(Z), hg.rts_smoother(item, Z)
@@ -34,7 +33,6 @@ def test_what_cannot_be_smoothed_is_refused():
         hg.rts_smoother(hg.kalman_filter(PLANT, SENSOR), np.zeros((3, 2)))
 
 
-@pytest.mark.slow
 def test_one_row_is_smoothed_to_what_the_filter_says_and_none_is_refused():
     """Alone, and in the runs of a simulation."""
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)

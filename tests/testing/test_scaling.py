@@ -48,7 +48,6 @@ def test_linear_networks(name):
     assert check_scaling(linear_network(CHANNELS[name])) <= 1
 
 
-@pytest.mark.slow
 def test_a_mixture():
     two = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], two)

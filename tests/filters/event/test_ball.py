@@ -30,7 +30,6 @@ def on_a_grid(centre, variance, radius, inside):
     return mass, mean, np.einsum("iab,jab,ab->ij", apart, apart, weight) / mass
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize(
     ("centre", "variance"),
@@ -45,7 +44,6 @@ def test_moments_of_two_components_are_those_of_a_grid(centre, variance, inside)
     np.testing.assert_allclose(result.covariance, covariance, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_three_components_are_those_of_draws():
     """Five deviations of a mean of a million draws."""
     centre, variance = np.array([0.3, -0.2, 0.5]), np.array([0.2, 0.5, 0.1])

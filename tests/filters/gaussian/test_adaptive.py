@@ -25,7 +25,6 @@ def plain(variance=4.0):
     return hg.kalman_filter(PLANT, hg.LinearSensor(C, variance * np.eye(2)))
 
 
-@pytest.mark.slow
 def test_a_variance_that_jumps_is_followed():
     """NEES within 0.1 of 1 and a smaller error than the filter that keeps R = 4."""
     truth, z = drawn(0.0)
@@ -33,7 +32,6 @@ def test_a_variance_that_jumps_is_followed():
     assert error < fixed and abs(nees - 1) < 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("memory", [0.9, 0.5])
 def test_losses_leave_the_prior(memory):
     """With 90 % lost the printed recursion reaches R = 0 and a NEES of millions; towards a prior it stays at 1."""
@@ -58,7 +56,6 @@ def printed(z, memory, iterations=5):
     return np.array(squares)
 
 
-@pytest.mark.slow
 def test_the_printed_recursion_forgets_to_no_noise_after_losses():
     """After 200 lost values it claims less than half of the variance that it should; losses leave ours as it was."""
     z = np.full(202, np.nan)

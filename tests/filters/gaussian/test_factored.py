@@ -76,7 +76,6 @@ def test_it_is_the_filter_it_is_made_of(name):
     )  # fmt: skip
 
 
-@pytest.mark.slow
 def test_its_innovations_are_the_filter_s():
     base = hg.linear_filter(LINE, LINEAR, APART)
     item, u, z = factored(base), np.array([0.1]), np.array([1.2, np.nan])

@@ -26,7 +26,6 @@ def columns():
     return Columns(rng.normal(size=(4, 7)), rng.uniform(0.1, 2.0, 7))
 
 
-@pytest.mark.slow
 def test_factors_are_those_of_the_sum(columns):
     factors = in_float64(factors_of)(columns)
     expected = (columns.matrix * columns.weights) @ columns.matrix.T

@@ -73,7 +73,6 @@ def cases():
         )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", list(cases()), ids=lambda c: f"{c[0]}, {c[1]}")
 def test_bounded_filters_are_the_oracles_recursion(case):
     name, _, build, update, predict, reference = case
@@ -135,7 +134,6 @@ def test_scaling_signal_gain_and_noise_together_changes_nothing():
     agree(follow(hg.cubature_filter(*ours, machine.channel(traded)), z), first)
 
 
-@pytest.mark.slow
 def test_a_silent_amplifier_leaves_the_inflated_prediction():
     """alpha = 0: K = 0 and Xi = (1 + beta_1) P-."""
     off = {**STRONG, "alpha": 0.0}

@@ -37,7 +37,6 @@ def claimed(item):
     return np.array(results)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("wide", "precise"), [(1e4, 1e-9), (1e8, 1e-12), (1e6, 1e-3), (1e2, 1.0)])
 def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     """A difference P - K C P is 1e-16 P wrong: 7e4 times what is left in the second case.
@@ -54,7 +53,6 @@ def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
     np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
 
 
-@pytest.mark.slow
 def test_a_run_takes_the_form_that_its_numbers_need():
     """Beside a precise one or alone, a run's bits are the same."""
     plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
@@ -70,7 +68,6 @@ def test_a_run_takes_the_form_that_its_numbers_need():
     assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
     """The gradient of a sum over runs is each run's gradient, to rounding."""
     item = hg.linear_filter(hg.LinearPlant(A, 0.01, [0.0, 0.0], 1.0), hg.LinearSensor(C, 0.1), hg.perfect(1))
@@ -111,7 +108,6 @@ def test_what_rounding_leaves_of_a_variance_is_right_or_is_no_less():
     assert 0 < lost < WIDE.size * PRECISE.size * STEPS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("tied", [0.0, 0.9])
 def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     """The condition of S is 1e9, its solution is that many times rounding off; one after another they are not.
@@ -129,7 +125,6 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
@@ -209,7 +204,6 @@ def test_more_precise_outputs_than_are_unrolled():
     np.testing.assert_allclose(estimate.mean, left @ h.T @ z / d, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_a_noise_free_output_has_a_gradient():
     """dx/dP of x = P z / (P + 0) is 0, and of the state that is not received too."""
 
@@ -222,7 +216,6 @@ def test_a_noise_free_output_has_a_gradient():
         assert float(jax.jit(jax.grad(mean))(2.0)) == pytest.approx(0.0, abs=1e-15)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "left"), [(hg.perfect(1), 1e-28), (hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 1e-9), 1.0)]
 )
@@ -314,7 +307,6 @@ def test_the_covariance_of_an_unstable_plant_held_by_its_inputs_stays(make):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(moved.state))
 
 
-@pytest.mark.slow
 def test_behind_a_random_gain_far_from_zero_a_combination_that_says_nothing_is_left_out():
     """Three outputs of two states are tied and so is the noise of the random gain, of which 1e-6 is not along the mean.
 

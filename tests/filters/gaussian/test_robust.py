@@ -34,7 +34,6 @@ def robust(rule=None, law=None, channel=None, plant=PLANT, output=C):
     return hg.robust_filter(plant, sensor, hg.perfect(len(output)) if channel is None else channel, rule)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("law", [hg.Contaminated(0.5, 0.2, 8.0, 1.5), hg.StudentT(0.5, 3.0)])
 @pytest.mark.parametrize("z", [0.2, 3.0, -6.0])
 def test_the_score_has_the_exact_moments_of_one_component(law, z):
@@ -99,7 +98,6 @@ def test_no_single_value_takes_the_estimate_far(rule):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", [hg.filters.InverseMultiquadric(), hg.filters.WoLF(1.3), hg.filters.Gate()])
 def test_an_infinitely_far_value_counts_as_missing(rule):
     item = robust(rule)
@@ -110,7 +108,6 @@ def test_an_infinitely_far_value_counts_as_missing(rule):
     assert innovation.weight[0] < 1e-200
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES)
 def test_nothing_that_arrives_changes_nothing(rule):
     item = robust(rule)
@@ -154,7 +151,6 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
         assert z.var() == pytest.approx(claimed, abs=4 * np.std((z - z.mean()) ** 2) / 447)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "transform", [hg.filters.Cubature(), hg.filters.Linearization(), hg.filters.Unscented(1.0, 0.0, 1.0)]
 )

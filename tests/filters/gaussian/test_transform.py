@@ -19,7 +19,6 @@ def test_affine_functions_are_exact(rule):
     np.testing.assert_allclose(result.cross, COVARIANCE @ a.T, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_cubature_mean_is_exact_to_degree_three():
     with jax.enable_x64(True):
         result = Cubature().apply(

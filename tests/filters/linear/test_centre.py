@@ -12,7 +12,6 @@ SKEWED = hg.random_affine.FiniteSupport([[1.0], [-0.25]], [0.2, 0.8])
 EITHER = hg.random_affine.FiniteSupport([[0.1], [-0.1]], [0.5, 0.5])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("build", [hg.polynomial_filter, hg.filters.scheduled_polynomial_filter])
 @pytest.mark.parametrize("mean", [1e4, 1e8])
 def test_where_the_state_is_does_not_matter_behind_a_known_gain(build, mean):
@@ -30,7 +29,6 @@ def test_where_the_state_is_does_not_matter_behind_a_known_gain(build, mean):
     np.testing.assert_allclose(far.mean - mean, near.mean, atol=1e-15 * mean + 1e-14)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("growth", "steps"), [(1.02, 900), (1.5, 50)])
 def test_what_a_growing_state_claims_is_its_error(growth, steps):
     """Gaussian noises: the quadratic filter is the linear one, whose error is the Riccati equation's."""
@@ -44,7 +42,6 @@ def test_what_a_growing_state_claims_is_its_error(growth, steps):
         assert item.inner.covariances[-1, 0, 0] == pytest.approx(p, rel=1e-6)  # what may be lost before it is seen
 
 
-@pytest.mark.slow
 def test_a_growing_mean_and_a_noise_with_a_mean():
     plant = hg.LinearPlant([[1.1]], hg.Gaussian([[0.1]], [3.0]), [5.0], 1.0)
     sensor = hg.LinearSensor([[2.0]], SKEWED)

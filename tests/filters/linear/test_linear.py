@@ -53,7 +53,6 @@ def test_the_linear_filter_beats_the_others_behind_fading(behind_fading):
     assert behind_fading["mean_gain"].nees_per_dimension()[0] > 2  # it does not know
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("corner", range(len(LAW.extremes())))
 def test_upper_claims_hold_under_every_extreme_law(corner):
     believed = hg.hop(LAW, 0.05, dimension=2)
@@ -70,7 +69,6 @@ def test_a_false_claim_is_found(behind_fading):
     assert worst.z > 5 and worst.ratio > 2
 
 
-@pytest.mark.slow
 def test_time_varying_parts_are_read_at_their_step():
     horizon = 5
     channels = hg.model.over_time([hg.hop(0.2 + 0.3 * k, 0.05, dimension=2) for k in range(horizon)])
@@ -135,7 +133,6 @@ def _gain(item, state, k):
     return np.stack([item.step(state, unit, (), k)[1].mean - zero for unit in np.eye(2)], axis=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("closed", "low", "high"), [(False, 0.9, 1.1), (True, 0.2, 0.4)])
 def test_a_random_gain_makes_the_claim_one_for_inputs_known_in_advance(closed, low, high):
     """E[(x - m)^2] / P after 15 steps of a = 1.2 with u = -a m, from the estimate or from the mean before data.

@@ -54,7 +54,6 @@ def single(s, keep):
     return s._replace(channel=hg.random_affine.Series([s.channel, hg.random_affine.known(row)]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_missing_component_is_a_channel_that_is_off(missing):
     """Every monomial with the component in it goes; what is left is the filter of the other component alone."""
@@ -67,7 +66,6 @@ def test_a_missing_component_is_a_channel_that_is_off(missing):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
 
-@pytest.mark.slow
 def test_nothing_arrives_for_a_while():
     """A gap is a stretch behind a silent channel, whose saved gains are then exact again."""
     horizon, gap = 8, range(3, 5)

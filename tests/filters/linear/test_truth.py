@@ -97,7 +97,6 @@ ONE_MEAN = Modes(
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "matters"),
     [

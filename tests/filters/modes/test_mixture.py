@@ -18,7 +18,6 @@ def one_step(plant, sensor, channel, z, **options):
     return item.step(item.init(), np.atleast_1d(z))[1]
 
 
-@pytest.mark.slow
 def test_gaussian_laws_give_the_linear_filter():
     plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], 0.3, [1.0, 0.0], np.eye(2))
     sensor, channel = hg.LinearSensor([[1.0, 0.5]], 0.2), hg.hop(0.8, 0.1)
@@ -131,7 +130,6 @@ def test_modes_are_weighed_with_their_atoms():
         np.testing.assert_allclose(state.law, law, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_chain_that_forgets_is_a_mixture():
     """Equal rows: the same numbers as one map chosen anew at each step."""
     law = [0.75, 0.25]
@@ -161,7 +159,6 @@ def test_a_drift_has_no_atoms():
         hg.filters.mixture_filter(PLANT, SENSOR, hg.model.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("channel", [hg.dropout(hg.perfect(), 0.0), hg.model.silent(noise=0), hg.hop(0.0, 0.0)])
 def test_a_value_that_no_combination_leaves_says_nothing(channel):
     """It was NaN for ever; the likelihood is none, and the next value is used as if it had not been."""

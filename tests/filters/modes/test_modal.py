@@ -111,7 +111,6 @@ def test_it_is_the_best_over_all_paths(name):
     np.testing.assert_allclose(filtered(channel), expected(law, transitions, constant(maps)), **EXACT)
 
 
-@pytest.mark.slow
 def test_maps_may_vary_while_the_chain_does_not():
     chain = hg.random_affine.MarkovChain(CHAIN_B, LAW_B)
     maps = [[hg.hop((1 + k) * g, 0.1 + 0.1 * k) for g in (0.3, -0.6, 1.2)] for k in range(STEPS)]

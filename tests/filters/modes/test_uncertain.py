@@ -21,7 +21,6 @@ def bound(channel, steps=STEPS):
     return item, item.planned(np.zeros((steps, 0))).covariances[2::2, 0, 0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "known", "worst"), [(0.005, 0.301, 0.268), (0.01, 0.369, 0.297), (0.02, 0.518, 0.352)]
 )

@@ -92,7 +92,6 @@ def test_against_a_true_clock_and_in_motion_both_are_found(moving):
     assert nees(moving["guarded"], slice(0, 2)) == pytest.approx(1.0, rel=3 / np.sqrt(RUNS))
 
 
-@pytest.mark.slow
 def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     """As known exactly; the published .54 and 21 are of one simulation, whose squares have a deviation of 1/7."""
     errors, _ = moving["ignored"]
@@ -106,7 +105,6 @@ def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trap", "filters"), [("resting", ""), ("moving", ", alone")], ids=["at rest", "no true clock"]
 )
@@ -120,7 +118,6 @@ def test_what_cannot_be_observed_is_not_claimed(trap, filters, request):
     assert np.all(true[[0, 2, 3]] < (1 + 3 / np.sqrt(2 * RUNS)) * claimed[[0, 2, 3]])
 
 
-@pytest.mark.slow
 def test_a_true_clock_that_falls_silent_is_none():
     """After as many steps as there are states."""
     plant, _, joint, channel = seen_by("ab")
@@ -145,7 +142,6 @@ def test_two_wrong_clocks_may_be_wrong_together():
         assert same is not expected[0]
 
 
-@pytest.mark.slow
 def test_a_plant_given_as_functions_has_the_same_clocks():
     plant, _, joint, channel = seen_by("ab")
     step = np.array(F)
@@ -165,7 +161,6 @@ def test_a_plant_given_as_functions_has_the_same_clocks():
         np.testing.assert_allclose(both[0][1].covariance, both[1][1].covariance, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_contract():
     plant, _, joint, channel = seen_by("ab")
     check_filter(clock_filter(plant, joint, channel, ["b"]))

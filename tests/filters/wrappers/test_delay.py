@@ -53,7 +53,6 @@ def filters():
     return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNKNOWN)}
 
 
-@pytest.mark.slow
 def test_unknown_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
     received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
     result = true_error(filters["uninformed"], PLANT, SENSOR, UNKNOWN, STEPS)
@@ -97,7 +96,6 @@ def claimed(a, c, r, q, weights, gains, noise):
 numbers = st.floats(-1.0, 1.0)
 
 
-@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(numbers, min_size=4, max_size=4), st.lists(numbers, min_size=2, max_size=2), st.integers(0, 2**32 - 1))
 def test_unknown_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
@@ -136,7 +134,6 @@ def test_delays_that_are_a_chain():
     np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
     """Values received twice, out of order, lost, and too late to be of any step."""
@@ -152,7 +149,6 @@ def test_known_the_claim_is_the_best_linear_error_given_the_delays(filters, seed
     np.testing.assert_array_equal(unknown.mean, state.mean)
 
 
-@pytest.mark.slow
 def test_a_constant_delay_is_predicted_over(filters):
     """Against the filter of all that was sent, which has the same through gaps; with an input, and its innovation."""
     plant = hg.LinearPlant(A, Q, START, SPREAD, input_matrix=[[0.0], [1.0]])
@@ -233,7 +229,6 @@ def test_relays_that_are_late_by_chance(simulated):
     assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
 
 
-@pytest.mark.slow
 def test_a_record_as_events(simulated):
     """Each value under the step that it is of; a value that is received twice comes under one number twice."""
     network, record = simulated

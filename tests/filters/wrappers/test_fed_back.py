@@ -23,7 +23,6 @@ def statistics() -> dict[str, dict[str, hg.Statistics]]:
     return hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 1, keep=hg.Statistics(), inputs=INPUTS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("node", ["sure", "lossy"])
 def test_claims_are_exact(statistics: dict[str, dict[str, hg.Statistics]], node: str) -> None:
     s = statistics[node]["fed"]
@@ -34,7 +33,6 @@ def test_claims_are_exact(statistics: dict[str, dict[str, hg.Statistics]], node:
     assert np.trace(s.actual()[-1]) < 0.5 * np.trace(statistics[node]["open"].actual()[-1])
 
 
-@pytest.mark.slow
 def test_the_covariance_is_that_of_the_formula(statistics: dict[str, dict[str, hg.Statistics]]) -> None:
     a, c, q = np.array(PLANT.matrix), np.array([[1.0, 0.5]]), np.diag([0.1, 0.2])
     mean, second = 0.15 + 0.4 + 0.42, 0.3 * 0.25 + 0.4 + 0.3 * 1.96
@@ -47,7 +45,6 @@ def test_the_covariance_is_that_of_the_formula(statistics: dict[str, dict[str, h
     np.testing.assert_allclose(statistics["sure"]["fed"].claimed(), results, rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_a_nonlinear_sensor_takes_off_what_it_sends_of_the_prediction() -> None:
     """By hand: r = h(f(xhat)), and the gain's noise sees Var y + (E y - r)^2."""
     plant = hg.Plant(lambda x, u: jnp.sin(x) + 1, 0.1, [2.0], [[0.2]])

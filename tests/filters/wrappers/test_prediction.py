@@ -15,7 +15,6 @@ def filtered():
     return hg.cubature_filter(PLANT, SENSOR, CHANNEL)
 
 
-@pytest.mark.slow
 def test_it_is_the_step_ahead_of_the_filtered_estimate():
     base, z = filtered(), [[0.7], [np.nan], [-0.2], [1.1]]
     predicting = prediction_of(base)

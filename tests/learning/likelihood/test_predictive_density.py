@@ -136,7 +136,6 @@ def test_what_remembers_or_is_too_much_is_refused():
         hg.learning.predictive(PLANT, SENSOR, hops, np.zeros((3, 1)))
 
 
-@pytest.mark.slow
 def test_samples_needed_are_of_the_right_size():
     """Two points whose noise hides little: I and V by quadrature over z of a signal that is all but known."""
     values = [0.6, 1.0, 1.4], [0.2, 1.0, 1.8]  # of one structure: what is compiled for one law serves the other

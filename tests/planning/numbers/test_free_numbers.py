@@ -91,7 +91,6 @@ def first_step(measured):
     return type(measured)(*(None if part is None else part[0] for part in measured))
 
 
-@pytest.mark.slow
 def test_the_error_is_that_of_the_recursion(problem):
     name, item = problem
     result = item.at(item.numbers.start).covariances[0]
@@ -115,7 +114,6 @@ def test_the_error_is_that_of_the_recursion(problem):
     np.testing.assert_allclose(result, parts.sum(axis=0), rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     problem = problem_of("observed losses")
     result = problem.at(problem.numbers.start)
@@ -133,7 +131,6 @@ def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     assert mean <= p + q <= 1.05 * mean
 
 
-@pytest.mark.slow
 def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     result = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
@@ -157,7 +154,6 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     assert result.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
-@pytest.mark.slow
 def test_a_relay_is_placed_where_the_closed_form_puts_it():
     """One state, two hops, loss d^-3: above rho = 4 the best site leaves the middle, x (1 - x) = 1 / rho."""
     rho = 8.0
@@ -187,7 +183,6 @@ def test_a_relay_is_placed_where_the_closed_form_puts_it():
     assert hg.power(result.network).total == pytest.approx(power, rel=1e-7)
 
 
-@pytest.mark.slow
 def test_powers_and_amplifications_agree():
     """The same network by amplifications, as a function, and by powers, by name."""
 
@@ -205,7 +200,6 @@ def test_powers_and_amplifications_agree():
     assert capped.powers["node.hop1"][0] == pytest.approx(0.5, rel=1e-6) and capped.error > by_power.error
 
 
-@pytest.mark.slow
 def test_numbers_marked_where_they_stand_are_free():
     def marked():
         law = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3])
@@ -237,7 +231,6 @@ def test_bad_numbers_are_named(free, message):
         hg.design(one_hop, free=free, budget=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loss", [hg.erasure, hg.dropout])
 @pytest.mark.parametrize("budget", [None, 1.0])
 def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budget):
@@ -252,7 +245,6 @@ def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budge
     assert 0.1 < least.numbers["arrival"] < 0.9 and least.error <= best.error * 1.1 * (1 + 1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 2.0), (0.1, -np.inf)])
 def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, high, monkeypatch):
     monkeypatch.setattr("heliograph.planning.numbers.design.search", None)
@@ -266,7 +258,6 @@ def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, h
         hg.design(built, free={"noise": ends}, budget=1.0)
 
 
-@pytest.mark.slow
 def test_an_end_that_is_never_reached_may_be_none():
     """A transmitter without power is refused; one of any power above zero is not."""
 

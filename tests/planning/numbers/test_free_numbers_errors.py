@@ -85,7 +85,6 @@ def test_without_a_limit_of_power_a_watt_is_worth_nothing_and_the_inner_optimum_
     assert result.price == 0.0 and set(result.sensitivity.values()) == {0.0}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "free", "options", "message"),
     [

@@ -39,7 +39,6 @@ def test_other_steps_other_functions_and_a_start_of_their_own_compile():
     assert all(item._slopes is not shared for item in others)
 
 
-@pytest.mark.slow
 def test_a_number_outside_of_the_function_that_is_another_now_is_seen(monkeypatch):
     x = np.array([1.2])
     before = problem().at(x)

@@ -36,7 +36,6 @@ def test_two_hops_share_by_their_closed_form_and_one_gets_all():
         split_power([-1.0], 1.0)
 
 
-@pytest.mark.slow
 def test_the_envelope_is_concave_above_and_touches():
     draws = np.random.default_rng(0)
     alpha, full = draws.uniform(0.2, 5, (1, 4, 3)), draws.uniform(1, 3, (1, 4))

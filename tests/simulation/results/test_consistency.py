@@ -9,7 +9,6 @@ from scipy import stats
 import heliograph as hg
 
 
-@pytest.mark.slow
 @given(st.integers(1, 4), st.integers(0, 1000))
 def test_nees_is_the_quadratic_form(n, seed):
     rng = np.random.default_rng(seed)

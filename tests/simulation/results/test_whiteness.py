@@ -20,7 +20,6 @@ def received():
     return record.measurements["node"][0], filters
 
 
-@pytest.mark.slow
 def test_memory_is_found_where_a_filter_assumes_none(received):
     """Lag 1 is .30 and lag 2 .20; within four standard errors."""
     z, filters = received
@@ -30,7 +29,6 @@ def test_memory_is_found_where_a_filter_assumes_none(received):
     assert 0.05 < memory.predictable < 0.2
 
 
-@pytest.mark.slow
 def test_the_exact_filter_leaves_nothing_behind(received):
     z, filters = received
     memory = hg.simulation.memory_test(z, filters["exact"])
@@ -64,7 +62,6 @@ def test_bad_input():
         hg.simulation.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))
 
 
-@pytest.mark.slow
 def test_what_an_output_says_again_adds_nothing_to_the_innovations():
     """A sensor that reads the state twice without noise: the second reading has nothing new to say."""
     plant = hg.LinearPlant([[0.8]], noise=hg.Gaussian([[1.0]]), initial_mean=[0.0], initial_covariance=[[1.0]])

@@ -57,7 +57,6 @@ def world(plain):
     return hg.Network(plant, nodes)
 
 
-@pytest.mark.slow
 def test_planned_filters_tell_what_they_would_without_a_plan():
     """Step by step without a plan; a channel that erases takes no plan."""
     network = world(hg.hop(hg.Rayleigh(1.0), 0.1))
@@ -78,7 +77,6 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
         np.testing.assert_allclose(getattr(sums, name), getattr(stored, name), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_columns_of_what_relays_received_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, local_error_design(net, 4))

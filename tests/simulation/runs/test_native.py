@@ -185,7 +185,6 @@ def test_a_run_depends_on_no_other(monkeypatch):
         np.testing.assert_array_equal(whole.truth[runs], other.truth)
 
 
-@pytest.mark.slow
 def test_sums_depend_on_no_chunk(monkeypatch):
     monkeypatch.setenv(SETTING, "native")
     some = [hg.monte_carlo(linear(), HORIZON, 1000, 9, hg.Statistics(), chunk=chunk) for chunk in (32, 300, 4096)]
