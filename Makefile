@@ -29,7 +29,7 @@ test: .venv/.test  ## Check style and types, run the tests that guard daily work
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"; tests=$$?; \
 	wait $$types && exit $$tests
 
-check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (twenty more)
+check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (thirteen more)
 	$(BIN)/pytest -n 2 --dist loadfile -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
