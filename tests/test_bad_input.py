@@ -217,6 +217,7 @@ RUNS = [
     (lambda: node().filters["aware"].predict(None), "state", "None"),
     (lambda: node().filters["aware"].correct(None, [1.0]), "state", "None"),
     (lambda: node().filters["aware"].step((), [1.0]), "state", "()"),
+    (lambda: h.kalman_filter(*small()).step(3, [1.0]), "state", "3"),
     (lambda: node().filters["aware"].predict(h.kalman_filter(*small()).init()), "state", "Belief("),
 ]
 
@@ -230,6 +231,7 @@ def test_one_line_that_names_it(make, name, came):
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith(f"{name}: expected ")
+    assert "Tracer" not in message
     assert came in "got " + message.split(", got ", 1)[1]
 
 

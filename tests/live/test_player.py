@@ -6,7 +6,7 @@ import jax
 
 import heliograph as hg
 from heliograph.live.lanes import Lanes
-from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.side_by_side import Alike
 from tests.live import worlds
 
 FEW = 4  # programs: the filters begin by one; there were 136
@@ -24,8 +24,8 @@ def test_a_timeline_begins_with_few_programs(caplog):
 
 def test_a_step_is_traced_once_for_its_outputs_its_code_and_its_text(monkeypatch):
     """With all measurements, and without those that are implausible: tracing is most of what beginning costs."""
-    calls, step = [], AllFilters.step
-    monkeypatch.setattr(AllFilters, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
+    calls, step = [], Alike.step  # of the one group of filters
+    monkeypatch.setattr(Alike, "step", lambda filters, *data: calls.append(data) or step(filters, *data))
     plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5, states=["traced here alone"])
     item = hg.kalman_filter(plant, worlds.SENSOR)
     made = Lanes(hg.Network(plant, {"a": hg.Node(worlds.SENSOR, hg.perfect(), {"f": item})})).step_rows

@@ -21,6 +21,7 @@ from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.names import refuse_attribute
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
@@ -219,7 +220,8 @@ def _with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R
     try:
         return function(filter, state, *data)
     except (AttributeError, IndexError, TypeError):
-        if _form(state) == _form(filter.init()):
+        # A user's call says it, of the state that was given; those within its trace only fail.
+        if is_traced(state) or _form(state) == _form(filter.init()):
             raise
         raise fail("state", "one of the filter's, as its init() returns", shown(state)) from None
 

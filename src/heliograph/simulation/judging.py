@@ -39,20 +39,8 @@ def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, j
     }
 
 
-def _skipping(
-    filters: AllFilters,
-    states: PyTree,
-    z: Sequence[jax.Array],
-    u: jax.Array,
-    k: jax.Array,
-    drawn: Mapping[str, Drawn] | None,
-    skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]],
-) -> Stepped:
-    return filters.step(states, z, u, k, drawn, skip)
-
-
 # Traced once for the step with all data and for that without some: tracing is most of what a step takes to compile.
-_traced: Callable[..., Stepped] = eqx.filter_jit(_skipping, inline=True)  # type: ignore[call-overload]
+_step: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
 
 
 def step_with_all(
@@ -65,7 +53,7 @@ def step_with_all(
 ) -> Stepped:
     """Step all filters with all data, which they judge."""
     nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
-    return _traced(filters, states, z, u, k, drawn, nothing)
+    return _step(filters, states, z, u, k, drawn, nothing)
 
 
 def step_without(
@@ -78,7 +66,7 @@ def step_without(
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
     """Repeat a step, where each filter skips what it judged implausible the first time."""
-    after, outputs = _traced(filters, states, z, u, k, drawn, reasons(first[1]))
+    after, outputs = _step(filters, states, z, u, k, drawn, reasons(first[1]))
     return after, outputs | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
 
