@@ -27,7 +27,7 @@ class Data(NamedTuple):
 
 
 def gathered(network: Network, recording: object, inputs: Any, free: int, truth: Any = False) -> Data:
-    """Gather all recordings, checked against the network, as `Data`; with true states where these are asked for.
+    """Gather all recordings, checked against the network, as `Data`; with true states if they are needed.
 
     Raises:
         ValueError: recordings of other shapes, too short, or without any change.
