@@ -164,7 +164,7 @@ def behind(channel):
     hg.Stream(hg.linear_filter(plant, sensor, channel)).push([0.1, 0.2])
     return network, hg.power(network, 5).over_time
 """
-EACH = """
+TRIALS = """
 import json, sys, traceback
 outcomes = {}
 for kind, trial in json.loads(sys.argv[1]).items():
@@ -211,7 +211,7 @@ def outcomes(tmp_path_factory) -> dict[str, str]:
             path.write_text(before[:at] + made + before[at:])
     trials = {kind: trial for kind, (_, trial) in KINDS.items()}
     done = subprocess.run(
-        [sys.executable, "-c", WORLD + EACH, json.dumps(trials)],
+        [sys.executable, "-c", WORLD + TRIALS, json.dumps(trials)],
         env=os.environ | {"PYTHONPATH": str(copy.parent), "JAX_PLATFORMS": "cpu"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip

@@ -150,8 +150,8 @@ def design(model: Model, resolution: float) -> Designs:
 
 def _with_a_run(model: Model, setting: Setting, stages: Stages) -> tuple[Numbers, hg.Record]:
     designs = design(model, 0.0)
-    found = numbers(model, designs, setting, stages)
-    return found, hg.monte_carlo(designs.network(model), model.horizon, 1, setting.seed)
+    judged = numbers(model, designs, setting, stages)
+    return judged, hg.monte_carlo(designs.network(model), model.horizon, 1, setting.seed)
 
 
 def numbers(model: Model, designs: Designs, setting: Setting, stages: Stages) -> Numbers:
