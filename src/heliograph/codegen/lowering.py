@@ -44,8 +44,8 @@ class Lowering:
             for variable, value in zip(equation.outvars, self.equation(equation, arguments), strict=True):
                 aval: Any = variable.aval
                 if value.shape != aval.shape:  # a wrong rule is found where it is
-                    found = f"{value.shape} for {aval.shape}"
-                    raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {found}")
+                    shapes = f"{value.shape} for {aval.shape}"
+                    raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {shapes}")
                 values[variable] = value
         return [self._read(values, v) for v in jaxpr.outvars]
 

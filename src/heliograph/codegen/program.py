@@ -159,12 +159,12 @@ def uses(node: Any) -> Sequence[Node]:
 def in_order(items: Iterable[Any]) -> list[Any]:
     """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
 
-    def position(item: Any) -> int:
-        if isinstance(item, Store):
-            return item.node.serial
-        if isinstance(item, Loop | Guard):
-            return -1 if item.condition is None else item.condition.serial
-        return -1 if isinstance(item, Buffer) else item.serial
+    def position(x: Any) -> int:
+        if isinstance(x, Store):
+            return x.node.serial
+        if isinstance(x, Loop | Guard):
+            return -1 if x.condition is None else x.condition.serial
+        return -1 if isinstance(x, Buffer) else x.serial
 
     return sorted(items, key=position)
 
