@@ -13,6 +13,7 @@ from heliograph.codegen.nodes import Unsupported
 
 EPSILON = float(np.finfo(np.float64).eps)
 TINY = float(np.finfo(np.float64).tiny) / EPSILON
+Fraction = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
 
 
 def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -36,7 +37,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     first = jnp.where(above, 0.0, 1 / a)
     lower = density * jax.lax.while_loop(lambda s: s[1] > EPSILON * s[2], add, (a, first, first))[2]
 
-    def continue_fraction(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def continue_fraction(state: Fraction) -> Fraction:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _apart(b + numerator * d)
