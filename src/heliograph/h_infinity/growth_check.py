@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
+import scipy
 from typing_extensions import TypeAliasType
 
 from heliograph.h_infinity.interval import Interval, UnknownError, evaluate
@@ -148,7 +148,7 @@ def check_growth(
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
-    starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
+    starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
 
     def with_zero(points: np.ndarray) -> np.ndarray:
         return np.concatenate([points, np.zeros_like(points)], axis=1)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from scipy.special import ndtr
-from scipy.stats import norm
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.learning.intervals import mean_and_error
@@ -163,4 +163,4 @@ def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
     """Test a mean difference (steps,) against zero."""
     mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
-    return Comparison(mean, error, float(z), float(2 * norm.sf(abs(z))))
+    return Comparison(mean, error, float(z), float(2 * scipy.stats.norm.sf(abs(z))))

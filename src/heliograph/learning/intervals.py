@@ -3,7 +3,7 @@
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from scipy import fft, stats
+import scipy
 
 from heliograph.numerics.types import Float
 
@@ -44,7 +44,7 @@ def cosines(scores: Scores) -> LongRun:
     for s in scores:
         steps = len(s)
         count = max(int(0.4 * steps ** (2 / 3)), 1)
-        g = np.sqrt(1 / (2 * steps)) * fft.dct(s, axis=0)[1 : count + 1]
+        g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]
         parts.append(steps / count * g.T @ g)
         weights.append((steps, count))
     total = sum(steps for steps, _ in weights)
@@ -100,7 +100,7 @@ def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) 
 
 def quantile(freedom: float) -> float:
     """Number of standard errors that a 95 % interval reaches to each side."""
-    return float(stats.t.ppf((1 + LEVEL) / 2, freedom))
+    return float(scipy.stats.t.ppf((1 + LEVEL) / 2, freedom))
 
 
 def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:

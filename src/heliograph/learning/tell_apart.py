@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
@@ -86,7 +86,7 @@ def samples_to_tell(
     (gain_a, deviation_a), (gain_b, deviation_b) = of_laws
     # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2
     gain = gain_a + gain_b
-    needed = (norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
+    needed = (scipy.stats.norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
     return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from heliograph.codegen.engine import chosen
 from heliograph.codegen.lowering import like
+from heliograph.live.program_text import text_of
 from heliograph.live.static import Static, cast
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
@@ -144,7 +145,7 @@ class RowStep:
 
     @cached_property
     def program(self) -> str:
-        """Return the lowered step as text, which two processes compare to see that they compute the same."""
+        """Return the step as text, which two processes compare to see that they compute the same."""
         return _text(self._layout, self._like)
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
@@ -188,9 +189,9 @@ def _outputs(
 
 @lru_cache(TEXTS)
 def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
-    """Return the lowered step as text, once for networks that differ in numbers alone."""
+    """Return the step as text, once for networks that differ in numbers alone."""
     with jax.enable_x64(True):
-        return str(_stepped(layout).lower(list(numbers), np.zeros(layout.size)).as_text())
+        return text_of(_stepped(layout).trace(list(numbers), np.zeros(layout.size)).jaxpr)
 
 
 @lru_cache

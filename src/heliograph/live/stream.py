@@ -10,6 +10,7 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
 from heliograph.filters.plausibility import INPUT, in_words, why_inputs
+from heliograph.live.program_text import text_of
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
@@ -185,7 +186,7 @@ class _Placed:
     def identity(self) -> Identity:
         """Return versions, names, numbers and a hash of the step's program, whichever engine runs it."""
         with jax.enable_x64(True):
-            text = by_xla(self._static).lower(self.numbers, self._start, *self._data).as_text()
+            text = text_of(by_xla(self._static).trace(self.numbers, self._start, *self._data).jaxpr)
         filter = self.filter
         return {
             **versions(),

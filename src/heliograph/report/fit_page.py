@@ -6,8 +6,8 @@ from functools import partial
 
 import matplotlib
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
-from scipy.stats import binom
 
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
@@ -115,7 +115,7 @@ def _pits(received: list[Uniformity]) -> Figure:
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
         count = len(values)
-        low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
+        low, high = (scipy.stats.binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
         axes.hist(
             values, np.linspace(0, 1, BINS + 1).tolist(), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8
         )

@@ -4,7 +4,7 @@ from itertools import product
 
 import jax
 import numpy as np
-from scipy import stats
+import scipy
 
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.modes import JointModes, joint_modes
@@ -127,7 +127,7 @@ def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> f
     certain = error <= 1e-12 * scale  # the monomial does not vary: moments must agree to rounding
     assert np.all(difference[certain] <= 1e-9 * scale[certain]), f"{what}: a known moment differs"
     ratios = difference[~certain] / error[~certain]
-    limit = float(stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
+    limit = float(scipy.stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
     largest = float(ratios.max(initial=0.0))
     assert largest <= limit, f"{what}: a moment differs from the samples by {largest:.1f} standard errors"
     return largest

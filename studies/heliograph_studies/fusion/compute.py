@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
+from heliograph.linear.lift import lifted_system
+from heliograph.linear.recursion import lmmse
 from heliograph.numerics.check import fail
 from heliograph_studies import Inline, Stages, Unlisted, check_fields, sampled
 from heliograph_studies.cubature_fusion import setting as machine
@@ -136,9 +138,7 @@ def central(plant: hg.LinearPlant, parts: list[Part], steps: int) -> np.ndarray:
     sensors, channels = zip(*map(received_by, parts), strict=True)
     noise = np.diag(np.concatenate([np.diag(s.noise.covariance) for s in sensors]))
     sensor = hg.LinearSensor(np.concatenate([s.matrix for s in sensors]), noise)
-    channel = hg.parallel(channels)
-    everything = hg.linear_filter(plant, sensor, channel)
-    return np.asarray(hg.filters.true_error(everything, plant, sensor, channel, steps).true)
+    return lmmse(lifted_system(plant, sensor, hg.parallel(channels), 1, steps)).gains.covariance
 
 
 def equal_intersection(joint: np.ndarray) -> tuple[float, float]:

@@ -98,6 +98,7 @@ def _climb(
 ) -> tuple[Disturbance, jax.Array]:
     """Points of each energy and the ratios reached."""
 
+    @jax.jit  # traced once for its value and its gradient
     def gained(w: Disturbance) -> jax.Array:
         return jnp.mean(_output_energy(filter, world, draws, w))
 

@@ -8,7 +8,7 @@ from zlib import crc32
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+import scipy
 
 import heliograph as hg
 from heliograph.numerics.check import fail
@@ -238,7 +238,7 @@ def score(record: hg.Record, node: str, name: str) -> Score:
     ratio = {quantity: rmse[quantity] / claimed[quantity] for quantity in QUANTITIES}
     # The mean over independent seeds, and its 95 % interval by Student's law.
     of_seed = nees.mean(axis=1)
-    mean, width = of_seed.mean(), stats.t.ppf(0.975, seeds - 1) * of_seed.std(ddof=1) / np.sqrt(seeds)
+    mean, width = of_seed.mean(), scipy.stats.t.ppf(0.975, seeds - 1) * of_seed.std(ddof=1) / np.sqrt(seeds)
     interval = {"mean": float(mean), "low": float(mean - width), "high": float(mean + width)}
     return Score(rmse, claimed, ratio, common, interval, claimed_over_time, nees.mean(axis=0))
 

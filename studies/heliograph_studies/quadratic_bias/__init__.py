@@ -5,12 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+import heliograph as hg
 from heliograph.random_affine.moments.moment_noise import NoiseMoments
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
 from heliograph_studies import Sampled, Statement, Study, stated
 from heliograph_studies.curves import Curve, Panel, curves_over_time
 from heliograph_studies.quadratic_bias import compute
-from heliograph_studies.quadratic_bias.compute import CLAIMED, NODE, TRUE, Numbers, Outcome
+from heliograph_studies.quadratic_bias.compute import CLAIMED, NODE, TRUE, Outcome
 from heliograph_studies.quadratic_bias.setting import TABLE_1, Noises
 from heliograph_studies.quadratic_bias.setting import Setting as Setting
 
@@ -29,7 +30,7 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
         variances = {name: by_state[state] for name, by_state in example.covariance.items()}
         errors = {name: values[:, i] for name, values in example.errors.items()}
         names = ("linear", "quadratic", "memory", "cubic", "quartic")
-        drawn[f"fig{1 + i}_{state}"] = _trajectory(example, i, state)
+        drawn[f"fig{1 + i}_{state}"] = _trajectory(outcome.run, i, state)
         drawn[f"fig{3 + i}_covariance_{state}"] = _over_time(f"error variance of {state}", variances, names)
         drawn[f"fig{5 + i}_mse_{state}"] = _over_time(
             f"mean squared error of {state}", errors, ("linear", "quadratic", "cubic", "mixture"), begin=1
@@ -39,12 +40,12 @@ def figures(outcome: Outcome) -> dict[str, Figure]:
     return drawn
 
 
-def _trajectory(example: Numbers, i: int, state: str) -> Figure:
-    assert example.run.truth is not None
-    true = Curve("true", INK, example.run.truth[0, :, i])
-    means = {name: example.run.estimates[NODE][name].mean[0, :, i] for name in ("quadratic", "mixture")}
+def _trajectory(run: hg.Record, i: int, state: str) -> Figure:
+    assert run.truth is not None
+    true = Curve("true", INK, run.truth[0, :, i])
+    means = {name: run.estimates[NODE][name].mean[0, :, i] for name in ("quadratic", "mixture")}
     panels = [Panel(state, [true, Curve(name, COLOURS[name], np.asarray(mean))]) for name, mean in means.items()]
-    return curves_over_time(example.run.time, panels, "t")
+    return curves_over_time(run.time, panels, "t")
 
 
 def _over_time(label: str, values: Mapping[str, np.ndarray], names: Sequence[str], begin: int = 0) -> Figure:

@@ -64,7 +64,7 @@ ByState = dict[str, float]
 
 @dataclass(frozen=True)
 class Numbers:
-    """What is found of one model: variances designed and simulated by filter and state, and the first run.
+    """What is found of one model: variances designed and simulated by filter and state.
 
     covariance: error variances at t = 0 ... horizon; mean_covariance: their means over the steps that count.
     gain_percent: 100 (1 - ratio of the means) against the linear filter; simulated where nothing is designed.
@@ -80,12 +80,11 @@ class Numbers:
     model: Unlisted[Model]
     designed: Unlisted[dict[str, np.ndarray]]
     errors: Unlisted[dict[str, np.ndarray]]
-    run: Unlisted[hg.Record]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The publication's example, our scenario, and the example's bounds."""
+    """The publication's example, our scenario, and the example's bounds and first run."""
 
     seed: int
     runs: int
@@ -94,6 +93,7 @@ class Outcome:
     outage: Numbers
     example: Inline[Numbers]
     bounds: Unlisted[Boundedness]
+    run: Unlisted[hg.Record]
 
 
 class Designs(NamedTuple):
@@ -103,12 +103,16 @@ class Designs(NamedTuple):
     covariance: dict[str, np.ndarray]
     skewness: float
 
+    def network(self, model: Model) -> hg.Network:
+        """Return the network of a receiver with all filters."""
+        return hg.Network(model.plant, {NODE: hg.Node(model.sensor, model.channel, self.filters)})
+
 
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Design, simulate, and evaluate the bounds."""
     example, outage = setting.example(), setting.outage()
-    printed = stages("the example", lambda: numbers(example, 0.0, setting, stages))
-    ours = stages("outages", lambda: numbers(outage, RESOLUTION, setting, stages))
+    printed, shown = stages("the example", lambda: _with_a_run(example, setting, stages))
+    ours = stages("outages", lambda: numbers(outage, design(outage, RESOLUTION), setting, stages))
     square = lifted_system(*example[:3], 2, example.horizon)
     return Outcome(
         seed=setting.seed,
@@ -118,6 +122,7 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
         outage=ours,
         example=printed,
         bounds=stages("bounds", lambda: boundedness(square)),
+        run=shown,
     )
 
 
@@ -143,12 +148,16 @@ def design(model: Model, resolution: float) -> Designs:
     return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
 
 
-def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -> Numbers:
-    """Design all filters of a model, and run each on the same data."""
-    designs = design(model, resolution)
-    network = hg.Network(model.plant, {NODE: hg.Node(model.sensor, model.channel, designs.filters)})
+def _with_a_run(model: Model, setting: Setting, stages: Stages) -> tuple[Numbers, hg.Record]:
+    designs = design(model, 0.0)
+    judged = numbers(model, designs, setting, stages)
+    return judged, hg.monte_carlo(designs.network(model), model.horizon, 1, setting.seed)
+
+
+def numbers(model: Model, designs: Designs, setting: Setting, stages: Stages) -> Numbers:
+    """Run all filters of a model on the same data."""
+    network = designs.network(model)
     sums = hg.monte_carlo(network, model.horizon, setting.runs, setting.seed, hg.Statistics(), progress=stages.progress)
-    shown = hg.monte_carlo(network, model.horizon, 1, setting.seed)
 
     def named(values: np.ndarray, suffix: str = "") -> dict[str, float]:
         return {f"{state}{suffix}": value.tolist() for state, value in zip(model.states, values, strict=True)}
@@ -174,7 +183,6 @@ def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -
         model=model,
         designed=designs.covariance,
         errors={name: np.diagonal(part.actual(), axis1=1, axis2=2) for name, part in sums[NODE].items()},
-        run=shown,
     )
 
 
@@ -201,14 +209,14 @@ def write_record(outcome: Outcome, folder: Path) -> None:
     """Covariances and mean squared errors over time of the example, and its run, as NetCDF."""
     import xarray
 
-    example = outcome.example
-    truth, estimates = example.run.truth, example.run.estimates[NODE]
+    example, run = outcome.example, outcome.run
+    truth, estimates = run.truth, run.estimates[NODE]
     assert truth is not None
     data = {
         "covariance": (("design", "time", "state", "state_2"), np.array(list(example.designed.values()))),
         "mean_squared_error": (("filter", "step", "state"), np.array(list(example.errors.values()))),
         "truth": (("step", "state"), truth[0]),
-        "measurement": (("step",), example.run.measurements[NODE][0, :, 0]),
+        "measurement": (("step",), run.measurements[NODE][0, :, 0]),
         "estimate": (("filter", "step", "state"), np.array([e.mean[0] for e in estimates.values()])),
     }
     coordinates = {

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
-from scipy import stats
 
 import heliograph as hg
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION
@@ -115,7 +115,7 @@ def worst_z(outcome: Outcome, name: str = "receiver") -> tuple[float, int]:
 
 def z_limit(steps: int) -> float:
     """What the largest of `steps` values of |z| exceeds with probability FALSE_ALARM at most (Bonferroni)."""
-    return float(stats.t.isf(FALSE_ALARM / 2 / steps, BATCHES - 1))
+    return float(scipy.stats.t.isf(FALSE_ALARM / 2 / steps, BATCHES - 1))
 
 
 def statements(outcome: Outcome) -> dict[str, list[Statement]]:

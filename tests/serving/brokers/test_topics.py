@@ -157,7 +157,7 @@ def test_subjects_of_nats_are_the_same_sources(server, translator):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
-    """Twenty messages a second while it listens: their rate, the lateness of their date, and sources that run."""
+    """Forty messages a second while it listens: their rate, the lateness of their date, and sources that run."""
     where, stop = at(server, kind, "x"), threading.Event()
 
     def send() -> None:
@@ -168,7 +168,7 @@ def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
                 payload = json.dumps({"climate": {"temperature": 20 + k, "note": "ok"}, "last_seen": measured})
                 await client.publish("zigbee2mqtt.attic", payload.encode())
                 await client.publish("zigbee2mqtt.door", b"open")
-                await asyncio.sleep(0.05)
+                await asyncio.sleep(0.025)
                 if stop.is_set():
                     break
             await client.close()
@@ -178,13 +178,13 @@ def test_inspect_lists_the_topics_of_a_broker(server, capsys, kind):
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        assert cli.main(["inspect", f"{kind}://{where.host}:{where.port}", "--seconds", "2"]) == 0
+        assert cli.main(["inspect", f"{kind}://{where.host}:{where.port}", "--seconds", "1"]) == 0
     finally:
         stop.set()
         thread.join()
     said = capsys.readouterr().out
     row = re.search(r"zigbee2mqtt/attic +JSON +(\d+) +([0-9.]+) Hz +\S+ s +([0-9.]+)", said)
-    assert row is not None and int(row[1]) >= 10 and float(row[2]) < 25 and 2 <= float(row[3]) < 5
+    assert row is not None and int(row[1]) >= 10 and float(row[2]) < 50 and 2 <= float(row[3]) < 5
     assert re.search(r"zigbee2mqtt/door +no JSON", said)
     scope: dict[str, object] = {"hg": hg}
     exec(said[said.index("sources = {") :], scope)

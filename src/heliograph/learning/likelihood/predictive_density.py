@@ -6,9 +6,8 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+import scipy
 from scipy.special import logsumexp, ndtr
-from scipy.stats import kstest
 
 from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter, signal_of
 from heliograph.filters.modes.mixture import Component, atoms_of
@@ -50,13 +49,13 @@ def law_nodes(law: AbstractLaw, count: int) -> Discrete:
     points, weights = _normal(count)
     match law:
         case Rayleigh():
-            gains = stats.rayleigh.ppf(points, scale=float(law.scale))
+            gains = scipy.stats.rayleigh.ppf(points, scale=float(law.scale))
         case LogNormal():
-            gains = np.exp(float(law.log_mean) + float(law.log_deviation) * stats.norm.ppf(points))
+            gains = np.exp(float(law.log_mean) + float(law.log_deviation) * scipy.stats.norm.ppf(points))
         case Rician():
-            gains = stats.rice.ppf(points, float(law.sight) / float(law.scale), scale=float(law.scale))
+            gains = scipy.stats.rice.ppf(points, float(law.sight) / float(law.scale), scale=float(law.scale))
         case Nakagami():
-            gains = np.sqrt(stats.gamma.ppf(points, float(law.shape)) * float(law.power) / float(law.shape))
+            gains = np.sqrt(scipy.stats.gamma.ppf(points, float(law.shape)) * float(law.power) / float(law.shape))
         case _:
             gains = np.quantile(_drawn(law), points)
     return Discrete(gains, weights)
@@ -115,7 +114,7 @@ class Predictive(NamedTuple):
         values = self.pit[~np.isnan(self.pit)]
         if not len(values):
             raise fail("pits", "at least one measurement that arrived", "none")
-        test = kstest(values, "uniform")
+        test = scipy.stats.kstest(values, "uniform")
         return float(test.statistic), float(test.pvalue)
 
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 from scipy.special import expit, xlogy
-from scipy.stats import chi2, norm
 
 from heliograph.learning.intervals import mean_and_error
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
@@ -156,7 +155,7 @@ def loss_memory(fates: object) -> LossMemory:
             off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
             variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
     z = float(off / np.sqrt(variance)) if variance > 0 else 0.0
-    return LossMemory(float(ratio), float(chi2.sf(ratio, 1)), z, float(2 * norm.sf(abs(z))))
+    return LossMemory(float(ratio), float(scipy.stats.chi2.sf(ratio, 1)), z, float(2 * scipy.stats.norm.sf(abs(z))))
 
 
 def _likelihood(counts: np.ndarray) -> float:
@@ -224,9 +223,9 @@ def _ahead(lost: Packets, base: float, weight: float, step: float) -> tuple[Pack
     """P(lost) of each packet, and its derivatives (3, packets)."""
     before = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
     keep = [1.0, step - 1.0]
-    rate = lfilter([step], keep, before)  # r - base, which starts at 0
-    by_base = lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
-    by_step = lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - rate)])[: len(lost)])
+    rate = scipy.signal.lfilter([step], keep, before)  # r - base, which starts at 0
+    by_base = scipy.signal.lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
+    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - rate)])[: len(lost)])
     return base + weight * rate, np.stack([1 + weight * by_base, rate, weight * by_step])
 
 

@@ -11,7 +11,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import LOG, LONGEST, WHOLE, Batch, Part, topic_of
+from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, topic_of
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -60,7 +60,7 @@ class _Connection:
         client.on_connect, client.on_disconnect = self.connected, self.disconnected
         client.on_connect_fail = self.failed
         client.max_inflight_messages_set(MOST)
-        client.reconnect_delay_set(1, int(LONGEST))
+        client.reconnect_delay_set(FIRST, LONGEST)  # type: ignore[arg-type]  # parts of a second too
         if address.user is not None:
             client.username_pw_set(address.user, address.password)
         if context := address.tls():

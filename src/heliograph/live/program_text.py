@@ -1,0 +1,70 @@
+"""Text of a traced program, the same in each process that traces the same: what it computes, with its constants."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+
+from heliograph.live.snapshot import short_name
+
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+
+
+def text_of(program: ClosedJaxpr) -> str:
+    """Return operations, parameters and constants, a line for each operation; inner programs by their hash.
+
+    A lowered program says the same, and takes as long to write as half of the trace.
+    """
+    return _Writer().lines(program.jaxpr, program.consts)
+
+
+class _Writer:
+    """Writer of programs, each once wherever it is called."""
+
+    def __init__(self) -> None:
+        self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
+
+    def lines(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
+        """Return the lines of a program, whose variables are numbered in their order."""
+        numbers: dict[Var, int] = {}
+        head = [f"{self._defined(numbers, jaxpr.constvars)} = {[self._value(value) for value in consts]}"]
+        head += [self._defined(numbers, jaxpr.invars)]
+        body = [self._line(numbers, equation) for equation in jaxpr.eqns]
+        return "\n".join([*head, *body, self._used(numbers, jaxpr.outvars)])
+
+    def _line(self, numbers: dict[Var, int], equation: JaxprEqn) -> str:
+        used, how = self._used(numbers, equation.invars), self._value(equation.params)
+        return f"{self._defined(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
+
+    def _defined(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
+        for variable in variables:
+            numbers[variable] = len(numbers)
+        return " ".join(str(variable.aval) for variable in variables)
+
+    def _used(self, numbers: Mapping[Var, int], atoms: Sequence[Var | Literal]) -> str:
+        return " ".join(self._value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
+
+    def _value(self, value: Any) -> str:
+        match value:
+            case ClosedJaxpr():
+                return self._hash(value, value.jaxpr, value.consts)
+            case Jaxpr():
+                return self._hash(value, value, ())
+            case dict():
+                return "{" + ", ".join(f"{name}: {self._value(value[name])}" for name in sorted(value)) + "}"
+            case tuple() | list():
+                return "(" + ", ".join(map(self._value, value)) + ")"
+            case jax.Array() if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
+                return f"key {self._value(np.asarray(jax.random.key_data(value)))}"
+            case jax.Array() | np.ndarray():
+                return f"{value.dtype}{value.shape} {short_name(np.asarray(value))}"
+        # A function makes a derivative, of which a step computes none; a type has its name.
+        return getattr(value, "__name__", "") if callable(value) else ADDRESS.sub("", repr(value))
+
+    def _hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
+        if id(program) not in self._hashes:
+            self._hashes[id(program)] = program, short_name(self.lines(jaxpr, consts))
+        return self._hashes[id(program)][1]

@@ -1,0 +1,42 @@
+"""Texts of traced programs: equal for equal programs, and different where anything is that a result depends on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph.live.program_text import text_of
+
+
+def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
+    """Text of a program with an inner one, whose constant is `table`, and with branches and a derivative rule."""
+    table = jnp.asarray(table)
+
+    @jax.jit
+    def inner(x):
+        return jnp.where(x < below, x @ table, x**power)
+
+    def program(x):
+        key = jax.random.key(3)
+        y = jax.lax.cond(x[0] > 0, inner, lambda x: jax.nn.relu(x) + jax.random.normal(key, x.shape), inner(x))
+        return y.astype(dtype), jnp.cumsum(y)
+
+    return text_of(jax.jit(program).trace(np.zeros(3)).jaxpr)
+
+
+def test_the_same_program_has_the_same_text_whatever_was_traced_before():
+    with jax.enable_x64(True):
+        first = text(np.eye(3))
+        again = text(np.eye(3))
+        jax.clear_caches()
+        assert first == again == text(np.eye(3)) and "0x" not in first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"table": 2 * np.eye(3)}, {"power": 3}, {"dtype": np.float32}, {"below": 1.5}],
+    ids=lambda c: next(iter(c)),
+)
+def test_another_constant_or_parameter_is_another_text(change):
+    with jax.enable_x64(True):
+        assert text(np.eye(3)) != text(**{"table": np.eye(3), **change})
