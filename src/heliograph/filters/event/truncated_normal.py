@@ -37,7 +37,7 @@ def _one_by_one(moments: Moments) -> Moments:
 
     def written(*ends: jax.Array) -> TruncatedNormal:
         width = 1 if ends[0].size % PAIR else PAIR
-        every = jax.lax.map(lambda each: moments(*each), [end.reshape(-1, width) for end in ends])
+        every = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
         return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in every))
 
     return written
