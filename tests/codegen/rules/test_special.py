@@ -34,5 +34,5 @@ def test_masses_below_and_above_are_scipys():
     [(1.0, 0.0, 0.0), (1.0, np.inf, 1.0), (-1.0, 1.0, np.nan), (1.0, -1.0, np.nan), (np.nan, 1.0, np.nan)],
 )
 def test_at_the_ends_and_beyond(a, x, p):
-    found = computed([a], [x])
-    np.testing.assert_array_equal([found[0][0], found[1][0]], [p, 1 - p])
+    both = computed([a], [x])
+    np.testing.assert_array_equal([both[0][0], both[1][0]], [p, 1 - p])

@@ -28,7 +28,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     above = x > a + 1
     density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
 
-    # Each loop ends at once where the other serves.
+    # Below the mean the series; each loop ends at once where the other serves.
     def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         shape, term, total = state
         term = term * x / (shape + 1)
@@ -37,6 +37,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     first = jnp.where(above, 0.0, 1 / a)
     lower = density * jax.lax.while_loop(lambda s: s[1] > EPSILON * s[2], add, (a, first, first))[2]
 
+    # Above it the continued fraction by Lentz's two quotients C and D.
     def continue_fraction(state: Fraction) -> Fraction:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
@@ -47,6 +48,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     state = (jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
     upper = density * jax.lax.while_loop(lambda s: s[4] > EPSILON, continue_fraction, state)[3]
 
+    # Both masses, the smaller one to all its digits.
     p = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
     valid = (a > 0) & (x >= 0)
     return jnp.where(valid, p, jnp.nan), jnp.where(valid, jnp.where(above & (x < jnp.inf), upper, 1 - p), jnp.nan)
