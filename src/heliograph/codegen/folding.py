@@ -96,9 +96,9 @@ def is_finite(node: Node) -> bool:
 
 
 def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
-    if _is(a, 0):
+    if a.op == "constant" and a.value == 0:
         return b
-    if _is(b, 0):
+    if b.op == "constant" and b.value == 0:
         return a
     if type == "f64" and b.op == "neg":
         return graph.node("sub", type, a, b.args[0])

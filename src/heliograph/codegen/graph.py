@@ -30,11 +30,7 @@ class Graph:
             return simpler
         if op in COMMUTATIVE and args[0].serial > args[1].serial:
             args = (args[1], args[0])
-        return self.unfolded(op, type, args, value)
-
-    def unfolded(self, op: str, type: Type, args: tuple[Node, ...], value: Any = None) -> Node:
-        """Make a node without simplification."""
-        return self._once(op, type, args, value, max([a.block.depth for a in args], default=0))
+        return self._once(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
         """Make a constant."""
@@ -59,8 +55,7 @@ class Graph:
             return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
         indices = tuple(i for _, i in pairs)
         value = (buffer, offset, tuple(s for s, _ in pairs))
-        depth = max([i.block.depth for i in indices], default=0)
-        return self._once("load", buffer.type, indices, value, max(depth, buffer.block.depth))
+        return self._once("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
         """Store a number, in the open block."""
@@ -68,23 +63,21 @@ class Graph:
         buffer.stores.append(written)
         self.current.items.append(written)
 
-    def _once(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int) -> Node:
-        """Return the equal node of an open block, or make one: in the outermost block of this depth that may have it.
+    def _once(self, op: str, type: Type, args: tuple[Node, ...], value: Any, depth: int = 0) -> Node:
+        """Return the equal node of an open block, or make one: in the outermost block that may have it.
 
-        A pinned block holds what is made within it.
+        That has all arguments and at least this depth, or is pinned: such a block holds what is made within it.
         """
-        key = (op, type, args, value)
-        target, block = None, self.current
-        while True:
-            equal = block.seen.get(key)
-            if equal is not None:
-                return equal
-            if target is None and (block.depth <= depth or block.pinned or block.parent is None):
-                target = block
-            if block.parent is None:
-                break
+        key, block = (op, type, args, value), self.current
+        while (equal := block.seen.get(key)) is None and block.parent is not None:
             block = block.parent
-        assert target is not None
-        made = target.seen[key] = self.fresh(op, type, args, target, value)
-        target.items.append(made)
+        if equal is not None:
+            return equal
+        block = self.current
+        if block.parent is not None:
+            depth = max(depth, *[a.block.depth for a in args], 0)
+            while block.depth > depth and not block.pinned and block.parent is not None:
+                block = block.parent
+        made = block.seen[key] = self.fresh(op, type, args, block, value)
+        block.items.append(made)
         return made

@@ -30,6 +30,7 @@ class Lowering:
     def __init__(self, most: int = MOST) -> None:
         self.graph = Graph(most)
         self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
+        self.sizes: dict[Jaxpr, int] = {}  # of programs within loops and branches
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
         """Return the results of a traced program for these arguments."""
@@ -40,9 +41,12 @@ class Lowering:
         values |= zip(jaxpr.invars, inputs, strict=True)
         for equation in jaxpr.eqns:
             arguments = [self._read(values, v) for v in equation.invars]
-            results = self.equation(equation, arguments)
-            _check_shapes(equation, results)
-            values |= zip(equation.outvars, results, strict=True)
+            for variable, value in zip(equation.outvars, self.equation(equation, arguments), strict=True):
+                aval: Any = variable.aval
+                if value.shape != aval.shape:  # a wrong rule is found where it is
+                    shapes = f"{value.shape} for {aval.shape}"
+                    raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {shapes}")
+                values[variable] = value
         return [self._read(values, v) for v in jaxpr.outvars]
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
@@ -83,14 +87,6 @@ class Lowering:
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
         return self.known(v.val) if isinstance(v, Literal) else values[v]
-
-
-def _check_shapes(equation: JaxprEqn, results: Sequence[Value]) -> None:
-    """Raise unless a rule's results have the shapes of the trace, so that a wrong rule is found where it is."""
-    for variable, value in zip(equation.outvars, results, strict=True):
-        aval: Any = variable.aval
-        if value.shape != aval.shape:
-            raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {value.shape} for {aval.shape}")
 
 
 def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:

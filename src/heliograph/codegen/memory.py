@@ -1,5 +1,6 @@
 """Arrays in memory: a view of a buffer with strides, as NumPy's, whose numbers are loaded when they are used."""
 
+import math
 from collections.abc import Sequence
 from itertools import product
 
@@ -41,7 +42,7 @@ class InMemory:
     @property
     def size(self) -> int:
         """Return the number of entries."""
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
     @property
     def type(self) -> Type:

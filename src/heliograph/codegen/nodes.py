@@ -1,5 +1,6 @@
 """Nodes of a program: scalar operations in blocks, loops and guarded blocks between them, and arrays in memory."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
@@ -68,6 +69,21 @@ class Block:
         self.items: list[Node | Loop | Guard | Store | Check] = []
         self.seen: dict[Any, Node] = {}
 
+    def let_go(self) -> None:
+        """Empty this block and those inside, so that no number refers to itself and all are freed without a search."""
+        for statement in self.items:
+            if isinstance(statement, Node):
+                statement.value = None
+            elif isinstance(statement, Store):
+                statement.buffer.stores, statement.buffer.parts = [], []
+            elif isinstance(statement, Loop | Guard):
+                statement.body.let_go()
+                statement.results = []
+                if isinstance(statement, Loop):
+                    statement.parameters, statement.following = [], []
+                    statement.condition = statement.counter = None
+        self.items, self.seen, self.owner = [], {}, None
+
     def inwards(self) -> Iterator["Block"]:
         """Yield this block and the enclosing ones, outermost last."""
         block: Block | None = self
@@ -107,7 +123,7 @@ class Buffer:
     @property
     def size(self) -> int:
         """Return the count of numbers of one run."""
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
 
 class Store:

@@ -4,7 +4,7 @@ Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 
 that W consecutive runs of a block never wrap around; what is beyond the end is added to the beginning (`folded`).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     random_bits,
     rows,
     shapes,
+    special,
     views,
 )
 from heliograph.numerics.types import PyTree
@@ -66,16 +67,24 @@ def lower_traced(traced: ClosedJaxpr, tree: Any, most: int = MOST) -> Program:
     return Program(lowering.graph, inputs, outputs, tree)
 
 
-def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda node: True) -> dict[Any, None]:
-    """Nodes, loops, guards, buffers and stores that these numbers need, in an order without chance; `among` some."""
+def needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
+    """Nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
     while waiting:
         node = waiting.pop()
-        if node not in results and among(node):
+        if node not in results:
             results[node] = None
-            waiting += _needs(node)
+            waiting += node.args if is_plain(node) else _needs(node)
     return results
+
+
+REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
+
+
+def is_plain(node: Any) -> bool:
+    """Return whether all that an item of a program needs is its arguments: an operation outside of loops and guards."""
+    return type(node) is Node and node.block.parent is None and node.op not in REFERRING
 
 
 def _needs(node: Any) -> list[Any]:
@@ -85,9 +94,6 @@ def _needs(node: Any) -> list[Any]:
     owner = node.block.owner
     arguments = node.args if isinstance(node, Node) and node.op not in REFERRING else _arguments(node)
     return [*arguments] if owner is None else [owner, *arguments]
-
-
-REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
 
 
 def _arguments(node: Any) -> list[Any]:
@@ -113,34 +119,35 @@ def _arguments(node: Any) -> list[Any]:
 
 def fusable(node: Node, products: set[Node]) -> Node | None:
     """Return the product that is computed with a sum or difference as one operation."""
-    if node.op not in ("add", "sub") or node.type != "f64":
-        return None
-    results = [a for a in node.args if a in products and a.value is node]
-    return results[0] if results else None
+    for a in node.args:
+        if a.value is node and a in products:
+            return a
+    return None
 
 
 def products_of(items: Iterable[Any]) -> set[Node]:
     """Find products used once, by a sum or difference; mark each with its user, of two the later one."""
-    users: dict[Node, list[Any]] = {}
+    users: dict[Node, Any] = {}
     for statement in items:
         for used in uses(statement):
-            users.setdefault(used, []).append(statement)
+            if used.op == "mul" and used.type == "f64":
+                users[used] = None if used in users else statement
     results: set[Node] = set()
     taken: set[Node] = set()
-    for node in sorted((n for n in users if n.op == "mul" and n.type == "f64"), key=lambda n: -n.serial):
-        user = users[node][0]
-        single = len(users[node]) == 1 and isinstance(user, Node) and user.op in ("add", "sub")
-        if single and user.args[0] is not user.args[1] and user.block is node.block and user not in taken:
+    for node in sorted(users, key=lambda n: -n.serial):
+        user = users[node]
+        single = isinstance(user, Node) and user.op in ("add", "sub")
+        if single and user.block is node.block and user not in taken:
             node.value = user
             results.add(node)
             taken.add(user)
     return results
 
 
-def uses(node: Any) -> list[Node]:
+def uses(node: Any) -> Sequence[Node]:
     """Return the nodes that an item of a program uses directly."""
     if isinstance(node, Node):
-        return list(node.args)
+        return node.args
     if isinstance(node, Store):
         return [node.node, *node.indices]
     if isinstance(node, Guard):
@@ -150,34 +157,58 @@ def uses(node: Any) -> list[Node]:
     return []
 
 
-def varying(roots: Iterable[Node | Buffer], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return nodes, buffers, loops and guards that differ between runs if these input buffers do."""
-    following: dict[Any, list[Any]] = {}
+def in_order(items: Iterable[Any]) -> list[Any]:
+    """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
+
+    def position(x: Any) -> int:
+        if isinstance(x, Store):
+            return x.node.serial
+        if isinstance(x, Loop | Guard):
+            return -1 if x.condition is None else x.condition.serial
+        return -1 if isinstance(x, Buffer) else x.serial
+
+    return sorted(items, key=position)
+
+
+def varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
+    """Return which nodes, buffers, loops and guards of these, in order, differ if these input buffers do."""
 
     @cache
     def around(block: Block) -> list[Any]:
         return [b.owner for b in block.inwards() if b.owner is not None]
 
-    for node in needed(roots):
-        for source in _sources(node, around):
-            following.setdefault(source, []).append(node)
-        if isinstance(node, Store):  # a store makes its buffer differ
-            following.setdefault(node, []).append(node.buffer.owner[0])
     results: set[Any] = set(inputs)
+    left, count = items, 0
+    # A turn finds all but what differs by a later number, as in loops.
+    while len(results) > count:
+        count, before, left = len(results), left, []
+        for x in before:
+            if results.isdisjoint(x.args if is_plain(x) else _sources(x, around)):
+                left.append(x)
+                continue
+            results.add(x)
+            if isinstance(x, Store):  # a store makes its buffer differ
+                results.add(x.buffer.owner[0])
+    return results
+
+
+def crossing(items: Iterable[Any], spread: set[Any]) -> set[Any]:
+    """Return which of the items are needed to compute those that differ between runs: these, and statements."""
+    results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
     left = list(results)
     while left:
-        for node in following.get(left.pop(), ()):
-            if node not in results:
-                results.add(node)
-                left.append(node)
-    return results
+        x = left.pop()
+        around = [] if isinstance(x, Buffer) else [x.block.owner]
+        around += [x.value[0]] if isinstance(x, Node) and x.op in ("parameter", "result", "guarded") else []
+        left += [s for s in around if s is not None and s not in results]
+        results.update(around)
+    return results - {None}
 
 
 def _sources(node: Any, around: Callable[[Block], list[Any]]) -> list[Any]:
     """Return all of which any makes a number or a statement differ: arguments, memory, what is around it."""
     if isinstance(node, Buffer):
-        owner = node.owner[0]
-        return [owner] if owner is not node else [x for store in node.stores for x in _sources(store, around)]
+        return [node.owner[0]]
     # Statements: a loop differs by its condition.
     if isinstance(node, Loop):
         return [node.condition, *node.parameters] if node.length is None else []

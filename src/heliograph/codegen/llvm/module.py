@@ -14,8 +14,18 @@ from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
-from heliograph.codegen.nodes import Buffer, Guard, Loop, Node, Store, Type, Unsupported
-from heliograph.codegen.program import Program, Summed, needed, products_of, row_length, uses, varying
+from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
+from heliograph.codegen.program import (
+    Program,
+    Summed,
+    crossing,
+    in_order,
+    needed,
+    products_of,
+    row_length,
+    uses,
+    varying,
+)
 from heliograph.codegen.rules.loops import copied
 from heliograph.codegen.rules.random_bits import hash_function
 from heliograph.codegen.vectors.elementary import functions
@@ -116,23 +126,21 @@ def written(
     """Write a program; `differing` says of each input whether it differs between runs.
 
     `alone`: one run, whose arrays are used in place; results of the numbers `last` may overwrite arguments. `summed`:
-    outputs that are summed over runs.
+    outputs that are summed over runs. The program is let go of.
 
     Raises:
         Unsupported: an operation that has no text, or a program that is too long.
     """
     outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
-    items = needed(outputs)
-    operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
-    divisions = sum(isinstance(x, Node) and x.op in ("div", "sqrt") for x in items)
+    items = in_order(needed(outputs))
+    counts = Counter([x.op for x in items if isinstance(x, Node)])
+    operations = counts.total() - counts["constant"]
     if operations > LONGEST:
         raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
     # Numbers that differ between runs; all others are computed once.
-    spread = varying(outputs, lanes)
-    if alone:
-        spread = {*items, *program.inputs}
-    products = products_of(sorted_items(items)) if fuse else set()
+    spread = {*items, *program.inputs} if alone else varying(items, lanes)
+    products = products_of(items) if fuse else set()
     tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
     common = [b not in spread for b in outputs]
     spread -= set(tables)
@@ -149,10 +157,10 @@ def written(
         width,
         0,
     )
-    differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
-    mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
+    mine = crossing(items, spread)
     # What blocks read of memory that is filled anew in each turn of a loop has a place for each turn.
-    turning = {b for b in _read(mine) if b not in spread and b.kind == "scratch" and loops_of(b.block)}
+    turning = {b for b in owners if b not in spread and b.kind == "scratch" and loops_of(b.block)}
+    turning &= _read(mine) if turning else turning
     shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0, turning)
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
@@ -172,12 +180,14 @@ def written(
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
     source, results = _source(text, mine), [Output(b.type, b.shape) for b in outputs]
+    divisions = counts["div"] + counts["sqrt"]
+    program.graph.top.let_go()
     return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions)
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
     """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
-    read = _read(items)
+    read = _read(items) if outputs else set()
     if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")
 
@@ -188,14 +198,9 @@ def _read(items: Iterable[Any]) -> set[Buffer]:
     return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 
-def sorted_items(items: Iterable[Any]) -> list[Any]:
-    """Sort items, so that the text does not depend on the order of a set."""
-    return sorted(items, key=lambda x: x.serial if isinstance(x, Node) else -1)
-
-
 def _source(text: str, items: Iterable[Any]) -> Source:
     """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
-    counts = Counter(x.block for x in items if isinstance(x, Node))
+    counts = Counter([x.block for x in items if isinstance(x, Node)])
     turns = {block: turns_of(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
     return Source(zlib.compress(text.encode(), 1), counts.total(), work)

@@ -41,9 +41,7 @@ class Slots:
         return writer.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
 
     def store(self, writer: "Writer", node: Node, name: str) -> None:
-        """Store a number if the other function uses it."""
-        if node not in self.places or writer.width != 1:
-            return
+        """Store a number, which the other function uses."""
         kind = vector(node.type, 1)
         address = self._address(writer, node)
         if node.type == "bool":
@@ -117,7 +115,8 @@ class Writer:
 
     def _keep(self, node: Node, name: str) -> None:
         self.scopes[-1][node] = name
-        self.slots.store(self, node, name)
+        if self.width == 1 and node in self.slots.places:
+            self.slots.store(self, node, name)
 
     def _compute(self, node: Node) -> str:
         if node.op == "load":
@@ -133,11 +132,12 @@ class Writer:
 
     def operand(self, node: Node) -> str:
         """Return the name of a number in all lanes."""
-        if node.op == "constant":
-            return splat(node.value, node.type)
         for scope in reversed(self.scopes):
             if node in scope:
                 return scope[node]
+        if node.op == "constant":
+            name = self.scopes[0][node] = splat(node.value, node.type)
+            return name
         if node in self.mine and node.op != "counter":
             raise RuntimeError(f"{node} is used before it is computed")
         name = self.scopes[-1][node] = self._everywhere(self.scalar(node), node.type)

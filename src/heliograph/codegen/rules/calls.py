@@ -138,7 +138,7 @@ def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
         return lowering.inline(branches[0], inputs[1:])
     # Small branches are computed in any case, large ones in guarded blocks.
     conditions = _conditions(lowering, which, len(branches))
-    sizes = [size_of(branch.jaxpr) for branch in branches]
+    sizes = [size_of(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
         cheap = SHARE * sizes[k] <= max(sizes)

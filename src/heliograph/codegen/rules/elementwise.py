@@ -23,7 +23,11 @@ ELEMENTWISE = {name: name for name in (
 
 def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
     """Return the entries of several arrays in row-major order, axes of length 1 repeated."""
-    return [(a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist() for a in arrays]
+    size = math.prod(shape)
+    return [
+        [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()
+        for a in arrays
+    ]
 
 
 def _elementwise(op: str) -> Rule:

@@ -1,5 +1,6 @@
 """Rules of loops: short ones are written out; long ones stay loops with stacked results in memory, as does `while`."""
 
+import math
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
@@ -82,7 +83,7 @@ def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     fixed, rows = inputs[:consts], inputs[consts + carried :]
     carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
     # Short loops are written out.
-    if length * size_of(params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
+    if length * size_of(lowering, params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
         return _written_out(lowering, equation, fixed, carry, rows)
     jaxpr = params["jaxpr"].jaxpr
     # A carried number that the body returns unchanged is a constant of the loop.
@@ -185,14 +186,17 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     return _like(carry, loop.results)
 
 
-def size_of(jaxpr: Any) -> int:
-    """Estimate the count of numbers that a traced program computes."""
+def size_of(lowering: Lowering, jaxpr: Any) -> int:
+    """Estimate the count of numbers that a traced program computes, once for each that is lowered."""
+    if jaxpr in lowering.sizes:
+        return lowering.sizes[jaxpr]
     total = 0
     for equation in jaxpr.eqns:
-        inner = [size_of(getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
+        inner = [size_of(lowering, getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
         turns = equation.params["length"] if equation.primitive.name == "scan" else 1
         inner += [KERNEL] if equation.primitive.name == "runs_last" else []
-        total += turns * sum(inner) + sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
+        total += turns * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
+    lowering.sizes[jaxpr] = total
     return total
 
 

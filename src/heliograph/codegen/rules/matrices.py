@@ -1,5 +1,6 @@
 """Rules of sums, products and decompositions: written out, entry by entry."""
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -23,7 +24,7 @@ def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float
 def _reduction(op: str, empty: float) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
-        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(int(np.prod(shape, dtype=int)), -1)
+        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(math.prod(shape), -1)
         return [array_of([total(lowering.graph, op, type, row, _within(type, empty)) for row in x.tolist()], shape)]
 
     return rule
@@ -103,7 +104,7 @@ def _of_type(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
 def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
     """Arrange as (batch, free, contracted)."""
     free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
-    sizes = [int(np.prod([x.shape[d] for d in axes], dtype=int)) for axes in (batch, free, contracted)]
+    sizes = [math.prod(x.shape[d] for d in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
 
 

@@ -1,5 +1,6 @@
 """Rules of operations on arrays in memory that return another view of the same memory."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -128,7 +129,7 @@ def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
-    if int(np.prod(shape, dtype=int)) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
+    if math.prod(shape) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     if axis != 0:
         parts = [in_memory(lowering, x) for x in inputs]
