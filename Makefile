@@ -8,6 +8,8 @@ BIN := .venv/bin
 INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-compile
 # What was installed, on all cores: pip would use one.
 COMPILE := -W ignore -m compileall -qq -j 0 .venv/lib
+# A file to a process, in the order of tests/conftest.py.
+SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 CREATED := .venv/.python$(VERSION)
 
@@ -26,11 +28,11 @@ test: .venv/.test  ## Check style and types, run the tests that guard daily work
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy --strict src studies & types=$$!; \
-	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"; tests=$$?; \
+	$(BIN)/pytest $(SPREAD) -m "not slow"; tests=$$?; \
 	wait $$types && exit $$tests
 
 check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (thirteen more)
-	$(BIN)/pytest -n 2 --dist loadfile -m slow
+	$(BIN)/pytest $(SPREAD) -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
 	@rm -rf out/docs docs/_made

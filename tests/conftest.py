@@ -24,7 +24,7 @@ IN_A_HURRY = (
 
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
-MOST, GROWTH = 1.2e9, 0.2e9  # bytes of a process before it lets go after a file, and since it last did
+MOST, GROWTH = 1.5e9, 0.2e9  # bytes of a process before it lets go after a file, and since it last did
 WITHIN = 1.8e9  # before it lets go between two tests of a file, which share programs
 
 
@@ -56,6 +56,15 @@ def pytest_unconfigure(config):
     """Remove the folder."""
     if hasattr(config, "compilations"):
         shutil.rmtree(config.compilations, ignore_errors=True)
+
+
+LONG = ("tests/studies/", "tests/test_docs.py", "tests/test_readme.py", "tests/serving/")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Files that take long come first, so that no worker has one left when the other has none."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG))
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -117,9 +126,13 @@ def resident():
 
 
 def forget():
-    """Let go of all compiled programs."""
+    """Let go of all compiled programs, the compiler's and heliograph's."""
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
+        for module in [m for name, m in sys.modules.items() if name.startswith("heliograph.")]:
+            for function in vars(module).values():
+                if hasattr(function, "cache_clear"):
+                    function.cache_clear()
         gc.collect()
         if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps what is freed
             ctypes.CDLL(None).malloc_trim(0)

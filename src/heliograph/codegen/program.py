@@ -27,6 +27,7 @@ from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     random_bits,
     rows,
     shapes,
+    special,
     views,
 )
 from heliograph.numerics.types import PyTree

@@ -1,6 +1,5 @@
 """A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
-from heliograph.filters.event.parts import FLOOR, Parts, cut, join, log_total, reduced, safe_log, together
+from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.modes.side_information import SideInformation, pattern_of
@@ -195,26 +194,22 @@ class EventFilter(AbstractSizedFilter):
         if self.trigger.losses == "known":
             unsent = unsent.times(jnp.where(lost > 0, -jnp.inf, 0.0))
             dropped, forced = (hypothesis.times(jnp.where(lost > 0, 0.0, -jnp.inf)) for hypothesis in (dropped, forced))
-        edges = np.linspace(-1.0, 1.0, self.known + 1)
-        bins = list(pairwise(edges))
 
         # Known reference: every Gaussian cut to each part of the line, and joined part by part.
         if not self.follows:
-            every = together([unsent, forced]) if self.loses else unsent
-            slots = [join(self._inside(every, sender, interval)) for interval in bins]
-            every = together([dropped, forced])
-            slots += [join(piece) for piece in self._outside_of(every, sender, 1.0)] if self.loses else []
-            return self._or_nothing(together(slots).keep(as_it_was), wide)
+            slots, _ = self._inside(together([unsent, forced]) if self.loses else unsent, unsent.some(0, 0), sender)
+            if self.loses:
+                outside = self._outside_of(together([dropped, forced]), sender, 1.0)
+                slots = together([slots, join(outside, self._outside)])
+            return self._or_nothing(slots.keep(as_it_was), wide)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
-        split = Parts(*(leaf[: self.known] for leaf in unsent)), Parts(*(leaf[self.known :] for leaf in unsent))
-        slots = [join(self._inside(split[0], sender, interval)) for interval in bins]
-        others = self._inside(split[1], sender, (-1.0, 1.0)).keep(as_it_was)
+        slots, others = self._inside(unsent.some(0, self.known), unsent.some(self.known), sender)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
-        renewed = self._renewed(sender)
-        fresh = [join(piece.keep(renewed)) for piece in [*self._outside_of(dropped, sender, 1.0), forced]]
-        few = reduced(together([others, *fresh]), self.lost, slice(n + sender.start, n + sender.stop))
-        return self._or_nothing(together([*(slot.keep(as_it_was) for slot in slots), few]), wide)
+        outside = join(self._outside_of(dropped, sender, 1.0), self._outside)
+        fresh = together([outside, join(forced)]).keep(self._renewed(sender))
+        few = reduced(together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop))
+        return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 
     def _came(
         self, wide: Parts, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -230,34 +225,39 @@ class EventFilter(AbstractSizedFilter):
         if self.trigger.losses == "numbered":
             number = jnp.clip(jnp.where(jnp.isnan(lost), 0.0, lost).astype(int), 0, COUNTED - 1)
             label = label * (jnp.isnan(lost) | (jnp.arange(COUNTED) == number))
-        # Each mode's Gaussians, restricted to where the sender sends, then updated by the value.
-        pieces, signals = [], []
+        # Each mode's Gaussians, updated by the value, and after them as they were.
+        used, before, links = [], [], []
         for j in range(1 if self.alike else label.shape[1]):
             only = label if self.alike else jnp.zeros_like(label).at[:, j].set(label[:, j])
             mode = jnp.argmax(chance > 0) if self.alike else j
-            link = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
-            prior = wide.labelled(s, only)
-            pieces += self._selected(updated(prior, z, there, *link, sender, self.outputs, self.delivers), s, begun)
-            # What was to be expected of a value that comes: y where the sender had to send.
-            sent = join(together(self._selected(prior, s, begun)))
-            signals.append(
-                sent._replace(label=jnp.zeros((1, 1)))._replace(**arriving(sent, *link, sender, self.outputs))
-            )
+            links.append((jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]))
+            before.append(wide.labelled(s, only))
+            used.append(updated(before[-1], z, there, *links[-1], sender, self.outputs, self.delivers))
+        # Restricted to where the sender had to send.
+        count, size = len(links), len(label)
+        selected = self._selected(together([*used, *before]), s, begun)
+        pieces = [selected.some(start, start + size) for start in range(0, len(selected.log_weight), size)]
+        of_mode = [together(pieces[j :: 2 * count]) for j in range(2 * count)]
+        # What was to be expected of a value that comes.
+        signals = []
+        for sent, link in zip(map(join, of_mode[count:]), links, strict=True):
+            sent = sent._replace(label=jnp.zeros((1, 1)))
+            signals.append(sent._replace(**arriving(sent, *link, sender, self.outputs)))
         # One sum again, with a new reference.
-        whole = join(together(pieces).keep(self._renewed(sender)))
+        whole = join(together(of_mode[:count]).keep(self._renewed(sender)))
         whole = whole.labelled(s, _sent(whole.label[:, s], False))
         signal = join(together(signals))
         return self._alone(whole), signal.mean[0], signal.covariance[0]
 
-    def _selected(self, used: Parts, s: int, begun: jax.Array) -> list[Parts]:
-        """Each Gaussian where its sender had to send: outside the region, or anywhere if it was due."""
+    def _selected(self, used: Parts, s: int, begun: jax.Array) -> Parts:
+        """Gaussians where their sender had to send, all one time after another: outside, or anywhere if it was due."""
         waiting, due = self._by_age(used.label[:, s], begun)
         event = used.labelled(s, waiting)
         outside = self._outside_of(event, self.senders[s], 1 - RIM)
-        mass = jnp.max(jnp.stack([piece.log_weight for piece in outside]), axis=0)
+        mass = jnp.max(outside.log_weight.reshape(self._outside, -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
-        return [*outside, floor, used.labelled(s, due)]
+        return together([outside, floor, used.labelled(s, due)])
 
     def _by_age(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A sender's label (K, M, A, C) where it sends on an event alone, and where it sends in any case."""
@@ -286,25 +286,37 @@ class EventFilter(AbstractSizedFilter):
         unit = jnp.eye(n + 2 * m)
         return [(unit[n + m + i] - unit[n + i], delta[i]) for i in range(sender.start, sender.stop)]
 
-    def _inside(self, parts: Parts, sender: slice, interval: tuple[float, float]) -> Parts:
-        """Cut to the region; its first component to an interval, in units of delta."""
-        for i, (direction, delta) in enumerate(self._errors(sender)):
-            low, high = interval if i == 0 else (-1.0, 1.0)
-            if not self.ball or (i == 0 and interval != (-1.0, 1.0)):
-                parts = cut(parts, direction, low * delta, high * delta)
-        return self._cut_to_ball(parts, sender, 1.0, True) if self.ball else parts
+    def _inside(self, parts: Parts, others: Parts, sender: slice) -> tuple[Parts, Parts]:
+        """Cut to the region: Gaussians to each part of its first component's interval, joined; others to all of it."""
+        (direction, delta), *rest = self._errors(sender)
+        size, edges = len(parts.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
+        low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
+        every = together([parts] * self.known)
+        if self.ball:
+            every = cut(every, direction, low * delta, high * delta) if self.known > 1 else every
+            every = self._cut_to_ball(together([every, others]), sender, 1.0, True)
+        else:
+            whole = np.ones(len(others.log_weight))
+            low, high = np.append(low, -whole), np.append(high, whole)
+            every = cut(together([every, others]), direction, low * delta, high * delta)
+            for direction, delta in rest:
+                every = cut(every, direction, -delta, delta)
+        count = size * self.known
+        return join(every.some(0, count), self.known), every.some(count)
 
-    def _outside_of(self, parts: Parts, sender: slice, scale: float) -> list[Parts]:
-        """Cut to what is outside: the first component that is, above or below, those before it inside.
+    def _outside_of(self, parts: Parts, sender: slice, scale: float) -> Parts:
+        """Cut to what is outside, all one time after the other, `_outside` times.
 
-        Of a ball these are the parts outside of the box around it, and what the ball leaves of the box.
+        The first component that is, above or below, those before it inside; of a ball these are what is outside of the
+        box around it, and then what the ball leaves of the box.
         """
-        outside = []
-        for direction, delta in self._errors(sender):
+        outside, errors = [], self._errors(sender)
+        for i, (direction, delta) in enumerate(errors, 1):
             edge = scale * delta
-            outside += [cut(parts, direction, edge, jnp.inf), cut(parts, direction, -jnp.inf, -edge)]
-            parts = cut(parts, direction, -edge, edge)
-        return [*outside, self._cut_to_ball(parts, sender, scale, False)] if self.ball else outside
+            outside.append(cut_away(parts, direction, edge))
+            if i < len(errors) or self.ball:
+                parts = cut(parts, direction, -edge, edge)
+        return together([*outside, self._cut_to_ball(parts, sender, scale, False)] if self.ball else outside)
 
     def _cut_to_ball(self, parts: Parts, sender: slice, scale: float, inside: bool) -> Parts:
         directions, deltas = zip(*self._errors(sender), strict=True)

@@ -1,12 +1,12 @@
 """Weighted Gaussians of a sum: cut to where a component lies, joined, and reduced to few."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.linalg import symmetrize, with_rounding
@@ -40,6 +40,10 @@ class Parts(NamedTuple):
         """Multiply the weights by a factor."""
         return self._replace(log_weight=self.log_weight + log_factor)
 
+    def some(self, first: int, stop: int | None = None) -> "Parts":
+        """Take some of the Gaussians."""
+        return Parts(*(leaf[first:stop] for leaf in self))
+
     def keep(self, places: Array) -> "Parts":
         """Some components of the Gaussians, in another order."""
         return self._replace(mean=self.mean[:, places], covariance=self.covariance[:, places][:, :, places])
@@ -62,29 +66,39 @@ def together(parts: Sequence[Parts]) -> Parts:
     return Parts(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 
-def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array | float) -> Parts:
-    """Each Gaussian cut to lower <= d'x <= upper, and the Gaussian of the same moments.
+@jax.jit
+def cut(parts: Parts, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> Parts:
+    """Each Gaussian cut to lower <= d'x <= upper, (K,) or (), and the Gaussian of the same moments."""
+    law = _law(parts, direction)
+    return _cut(parts, law, [jnp.broadcast_to(end, law[0].shape) for end in (lower, upper)])
+
+
+@jax.jit
+def cut_away(parts: Parts, direction: jax.Array, edge: jax.Array) -> Parts:
+    """Each Gaussian cut to d'x >= edge, and after all these each cut to d'x <= -edge, (2 K,)."""
+    centre, column, variance = _law(parts, direction)
+    turned = jnp.concatenate([centre, -centre]), jnp.concatenate([column, -column]), jnp.tile(variance, 2)
+    return _cut(together([parts, parts]), turned, [jnp.full(2 * len(centre), edge)])
+
+
+def _law(parts: Parts, direction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean of d'x, (K,), its covariance with x, (K, N), and its variance, (K,)."""
+    column = parts.covariance @ direction
+    return parts.mean @ direction, column, column @ direction
+
+
+def _cut(parts: Parts, law: tuple[jax.Array, jax.Array, jax.Array], ends: Sequence[jax.Array]) -> Parts:
+    """Gaussians cut to where d'x is above the first end, and below the second if there is one.
 
     With c, S the mean and variance of d'x and k = P d / S:  w P(...), m + k sqrt(S) mu, P - k k' S (1 - v).
     """
-    above, below = (isinstance(end, float) and np.isinf(end) for end in (upper, lower))
-    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
-    # Law of d'x; without variance it lies inside or it does not.
-    centre, column = parts.mean @ direction, parts.covariance @ direction
-    variance = column @ direction
-    size = centre**2 + jnp.where(jnp.isfinite(upper), upper, 0.0) ** 2 + jnp.where(jnp.isfinite(lower), lower, 0.0) ** 2
-    certain = variance <= CERTAIN * size
+    centre, column, variance = law
+    # Without variance d'x lies inside or it does not.
+    certain = variance <= CERTAIN * (centre**2 + sum(end**2 for end in ends))
     deviation = jnp.sqrt(jnp.where(certain, 1.0, variance))
-    low, high = (lower - centre) / deviation, (upper - centre) / deviation
+    inside = (ends[0] <= centre) & (centre <= ends[-1] if len(ends) > 1 else True)
     # Moments of a standard normal number between the two, or beyond one.
-    if above:
-        moments = upper_tail(low)
-    elif below:
-        moments = upper_tail(-high)
-        moments = moments._replace(mean=-moments.mean)
-    else:
-        moments = truncated_normal(low, high)
-    inside = (lower <= centre) & (centre <= upper)
+    moments = (truncated_normal if len(ends) > 1 else upper_tail)(*((end - centre) / deviation for end in ends))
     log_mass = jnp.where(certain, jnp.where(inside, 0.0, -jnp.inf), moments.log_mass)
     gain = jnp.where(certain[:, None], 0.0, column / deviation[:, None])
     # Moments of the part inside, where it has any probability.
@@ -97,17 +111,26 @@ def cut(parts: Parts, direction: jax.Array, lower: Array | float, upper: Array |
     return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
 
 
-def join(parts: Parts) -> Parts:
-    """One Gaussian with the moments of the sum, (1, ...)."""
-    total = log_total(parts.log_weight)
-    share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
-    share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-    mean = share @ parts.mean
-    apart = parts.mean - mean
-    inside = parts.covariance + apart[:, :, None] * apart[:, None]
-    covariance = jnp.tensordot(share, inside, axes=1)
-    label = jnp.tensordot(share, parts.label, axes=1)
-    return Parts(total[None], mean[None], symmetrize(covariance)[None], label[None])
+def join(parts: Parts, groups: int = 1) -> Parts:
+    """Gaussians with the moments of the sum, (1, ...), or of each of so many groups of as many Gaussians."""
+    few: Parts = _join(parts, groups)
+    return few
+
+
+@partial(jax.jit, static_argnames="groups")
+def _join(parts: Parts, groups: int) -> Parts:
+    def joined(parts: Parts) -> Parts:
+        total = log_total(parts.log_weight)
+        share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+        share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
+        mean = share @ parts.mean
+        apart = parts.mean - mean
+        inside = parts.covariance + apart[:, :, None] * apart[:, None]
+        covariance = jnp.tensordot(share, inside, axes=1)
+        label = jnp.tensordot(share, parts.label, axes=1)
+        return Parts(total, mean, symmetrize(covariance), label)
+
+    return Parts(*jax.vmap(joined)(Parts(*(leaf.reshape(groups, -1, *leaf.shape[1:]) for leaf in parts))))
 
 
 def reduced(parts: Parts, count: int, places: slice) -> Parts:
@@ -116,13 +139,14 @@ def reduced(parts: Parts, count: int, places: slice) -> Parts:
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
     """
     while len(parts.log_weight) > count:
-        parts = _one_fewer(parts, places)
+        parts = _one_fewer(parts, (places.start, places.stop))
     return parts
 
 
-def _one_fewer(parts: Parts, places: slice) -> Parts:
+@partial(jax.jit, static_argnames="ends")
+def _one_fewer(parts: Parts, ends: tuple[int, int]) -> Parts:
     """The pair of least cost joined; it takes the place of its first, the last Gaussian that of its second."""
-    size = len(parts.log_weight)
+    size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
     top = jnp.max(parts.log_weight)

@@ -1,10 +1,13 @@
 """Moments of a standard normal number that is known to lie in an interval, to the last digits wherever that lies."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from heliograph.numerics.over_runs import runs_last
 
 REACH = (
     74.0  # density beyond sqrt(t^2 + REACH), t the interval's point nearest 0, is exp(-REACH / 2) = 8e-17 of that at t
@@ -25,6 +28,27 @@ class TruncatedNormal(NamedTuple):
     variance: jax.Array
 
 
+PAIR = 2  # computed side by side: of one alone each operation waits for the one before
+Moments = Callable[..., TruncatedNormal]
+
+
+def _one_by_one(moments: Moments) -> Moments:
+    """Compute moments for one pair of entries of equal arrays after another: native code has their arithmetic once."""
+
+    def written(*ends: jax.Array) -> TruncatedNormal:
+        width = 1 if ends[0].size % PAIR else PAIR
+        every = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
+        return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in every))
+
+    return written
+
+
+def _kernel(moments: Moments) -> Moments:
+    """Return a kernel of moments whose ends are arrays of one shape."""
+    return runs_last(moments, shapes=lambda *ends: TruncatedNormal(*[ends[0].shape] * 3), written=_one_by_one(moments))
+
+
+@_kernel
 def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
@@ -37,7 +61,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     by 40 Gauss-Legendre nodes. The variance is a sum of squares, so that it is never negative. Relative errors: of the
     variance 1e-13, of the mean and of the mass 1e-12. An interval of one point has the mass 0 (-inf) and variance 0.
 
-    Shapes: any that broadcast; the results have theirs.
+    Shapes: of both the same, which the results have.
 
     Source: Golub and Welsch, Calculation of Gauss quadrature rules (1969).
     """
@@ -52,14 +76,15 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     high = jnp.minimum(b - t, above)
     low = jnp.maximum(a - t, -jnp.sqrt(REACH))
     width = high - low
-    u = low[..., None] + width[..., None] * NODES
-    density = jnp.exp(-u * (u / 2 + t[..., None]))
+    nodes, weights = (array.reshape(-1, *[1] * low.ndim) for array in (NODES, WEIGHTS))
+    u = low + width * nodes
+    density = jnp.exp(-u * (u / 2 + t))
 
     # Mass, and variance about the mean of the nodes.
-    whole = jnp.sum(WEIGHTS * density, axis=-1)
-    share = WEIGHTS * density / whole[..., None]
-    middle = jnp.sum(share * u, axis=-1)
-    variance = jnp.sum(share * (u - middle[..., None]) ** 2, axis=-1)
+    whole = jnp.sum(weights * density, axis=0)
+    share = weights * density / whole
+    middle = jnp.sum(share * u, axis=0)
+    variance = jnp.sum(share * (u - middle) ** 2, axis=0)
 
     # Mean by the ends: (phi(a) - phi(b)) / Z with phi(a) - phi(b) = phi(a) (1 - exp(-(b - a)(b + a) / 2)).
     integral = whole * width
@@ -74,6 +99,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
 
 
+@_kernel
 def upper_tail(lower: jax.Array) -> TruncatedNormal:
     """Log mass, mean and variance of N(0, 1) above `lower`: `truncated_normal` by a tenth of its operations.
 

@@ -75,7 +75,7 @@ class ErrorStatistics:
 
     def actual(self) -> np.ndarray:
         """E[e e'] over the runs, (time, n, n)."""
-        moments: np.ndarray = self.outer.sum(axis=0) / self.runs
+        moments: np.ndarray = matrices(self.pairs.sum(axis=0)) / self.runs
         return moments
 
     def claimed(self) -> np.ndarray:
@@ -141,25 +141,26 @@ class ErrorStatistics:
         """
         if self.runs < 4:
             raise fail("worst direction", "at least 4 runs", self.runs)
-        broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
+        outer, covariance = self.outer, self.covariance
+        broken = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))
         self._tell()
         if np.any(broken):
-            undefined = np.full(self.outer.shape[-1], np.nan)
+            undefined = np.full(outer.shape[-1], np.nan)
             return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
-        halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
+        halves = [self._ratio_on(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
         return max(halves, key=lambda w: w.ratio)
 
-    def _ratio_on(self, held_out: np.ndarray) -> "WorstDirection":
+    def _ratio_on(self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray) -> "WorstDirection":
         chosen = ~held_out & (self.count > 0)
-        actual, claimed = self.outer[chosen].sum(axis=0), self.covariance[chosen].sum(axis=0)
+        actual, claimed = outer[chosen].sum(axis=0), covariance[chosen].sum(axis=0)
         # Step and direction of the largest ratio in the other half of the batches.
         values, directions = _generalised_eigen(actual, claimed)
         step = int(np.argmax(values[:, -1]))
         d = directions[step, :, -1]
         judged = held_out & (self.count > 0)
         # Ratio in this half.
-        error = np.einsum("i,bij,j->b", d, self.outer[judged, step], d)
-        bound = np.einsum("i,bij,j->b", d, self.covariance[judged, step], d)
+        error = np.einsum("i,bij,j->b", d, outer[judged, step], d)
+        bound = np.einsum("i,bij,j->b", d, covariance[judged, step], d)
         ratio = float(error.sum() / bound.sum())
         # Linearised error of a ratio of means: residuals error - ratio bound have mean zero over the batches.
         weights = self.count[judged]
