@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from heliograph.live.program_text import text_of
+from heliograph.numerics.over_runs import runs_last
 
 
 def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
@@ -40,3 +41,22 @@ def test_the_same_program_has_the_same_text_whatever_was_traced_before():
 def test_another_constant_or_parameter_is_another_text(change):
     with jax.enable_x64(True):
         assert text(np.eye(3)) != text(**{"table": np.eye(3), **change})
+
+
+@runs_last
+def doubled(x):
+    return 2 * x
+
+
+@runs_last
+def squared(x):
+    return x * x
+
+
+def test_kernels_of_the_same_shapes_differ_by_their_names():
+    """A kernel's arithmetic is not traced for the text: it is the library's, whose version is compared beside it."""
+
+    def text_with(kernel):
+        return text_of(jax.make_jaxpr(jax.vmap(kernel))(np.zeros((3, 2))))
+
+    assert text_with(doubled) == text_with(doubled) != text_with(squared)

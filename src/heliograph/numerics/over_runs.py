@@ -32,6 +32,11 @@ class _Kernel:
         self.source = source
         self.written = jax.jit(lambda args, kwargs: written(*args, **kwargs))
 
+    def __repr__(self) -> str:
+        """Return the name of the arithmetic, by which the texts of two programs differ."""
+        function = self.source.func if isinstance(self.source, partial) else self.source
+        return f"{function.__module__}.{function.__qualname__}"
+
 
 Shapes = Callable[..., PyTree]  # a kernel's arguments -> the shape of its result, or of each in a tuple
 
