@@ -19,6 +19,8 @@ def test_a_traced_number_is_found_where_it_stands(hold):
     assert results == [(True, False)]
 
 
-@pytest.mark.parametrize("value", [1, 2.0, True, np.float64(3), np.ones(2), None, "text", [1.0, np.ones(2)], ()])
+@pytest.mark.parametrize(
+    "value", [1, 2.0, True, np.float64(3), np.ones(2), None, "text", [1.0, np.ones(2)], (), iter([1.0])]
+)
 def test_what_is_known_is_not_traced(value):
     assert not is_traced(value)

@@ -4,7 +4,7 @@ A model's moments are plain numbers in ordinary use, and functions of traced par
 `jax.jit`. What is decided by a number's value (is it zero, is it certain) is decided for known numbers only.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +21,7 @@ def is_traced(*values: object) -> bool:
         isinstance(leaf, jax.core.Tracer)
         for value in values
         if not isinstance(value, np.ndarray | float | int)  # asked of each number of a model: known at a look
+        and not isinstance(value, Iterator)  # which is no tree of numbers to JAX
         for leaf in jax.tree.leaves(value)
     )
 
