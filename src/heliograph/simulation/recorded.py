@@ -163,8 +163,8 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 def _filtered(*arguments: PyTree) -> PyTree:
     """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
-    # Nodes by the hundred are no straight-line code.
-    return _in_parts(*arguments) if arguments[0].meshes else computed(_run_filters, _by_xla, arguments)
+    long = any(mesh.is_long for mesh in arguments[0].meshes.values())
+    return _in_parts(*arguments) if long else computed(_run_filters, _by_xla, arguments)
 
 
 def _in_parts(

@@ -16,6 +16,7 @@ from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
+from heliograph.simulation.centres.mesh import meshes_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.node import Node
@@ -97,7 +98,7 @@ def monte_carlo(
     single = _is_single(precision, network)
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if not single and not network.meshes and one_processor():
+    if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
         by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
         if by_native_code is not None:
             return by_native_code

@@ -17,7 +17,7 @@ from heliograph.fusion.mesh.rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, stack
+from heliograph.model.over_time import at, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
@@ -29,6 +29,8 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 DENSE = 200  # nodes whose joint covariance is propagated at every step
+STRAIGHT = 3_000  # numbers of all covariances that are sent in a step: of more native code takes longer to make,
+JOINT = 40  # as of more rows of a joint covariance
 Arrived = Bool[Array, "node rounds degree"]  # which messages arrived, each node's from itself first
 Ahead = Sequence[Sequence[Array]]  # parts and covariance of weights, by part of the nodes; none where there are none
 
@@ -102,6 +104,13 @@ class Mesh(Module):
     quantizer: AbstractQuantizer | None
     needs_joint: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
+
+    @property
+    def is_long(self) -> bool:
+        """Return whether a step has too many operations for native code, in which they are written one by one."""
+        n = len(first(self.plant).states)
+        sent = self.edges.rounds * np.count_nonzero(self.edges.present) * n * n
+        return bool(sent > STRAIGHT or (self.needs_joint and len(self.senders) * n > JOINT))
 
     def init(self) -> MeshState:
         """Return the state before the first step: the plant's mean and covariance at every node."""

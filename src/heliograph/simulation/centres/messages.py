@@ -53,7 +53,7 @@ def moved_beyond(
     """
     far = jnp.einsum("ida,idab,idb->id", off, information, off) > alpha * off.shape[-1]
     moving = (far & present)[:, 1:]  # for others
-    return jnp.zeros(len(off), dtype=bool).at[senders[:, 1:]].max(moving)
+    return jnp.zeros(len(off), dtype=int).at[senders[:, 1:]].add(moving.astype(int)) > 0
 
 
 def quantized(
