@@ -163,8 +163,9 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
 
 def _filtered(*arguments: PyTree) -> PyTree:
     """Results of `_run_filters` as NumPy arrays, by native code where it supports the filters."""
-    long = any(mesh.is_long for mesh in arguments[0].meshes.values())
-    return _in_parts(*arguments) if long else computed(_run_filters, _by_xla, arguments)
+    # Joint covariances are stored at places that the graph, an argument here, decides: XLA's.
+    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in arguments[0].meshes.values())
+    return _in_parts(*arguments) if by_xla else computed(_run_filters, _by_xla, arguments)
 
 
 def _in_parts(
