@@ -100,7 +100,7 @@ def memory_left():
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory(memory_left):
-    """Compiled programs are let go of when they, and what the compiler left, are a gigabyte: it takes time."""
+    """Compiled programs are let go of when they, and what the compiler left, are most of 1.5 GB: it takes time."""
     yield
     bound_memory(memory_left, MOST)
 
