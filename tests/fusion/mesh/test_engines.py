@@ -6,10 +6,12 @@ import pytest
 import heliograph as hg
 from heliograph.fusion import MatrixWeights, TraceIntersection
 from heliograph.simulation.centres.mesh import mesh_of
-from tests.fusion.mesh.worlds import PLANT, RING, network
+from tests.fusion.mesh.worlds import PLANT, network
 
 BURSTS = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.2), 0.1, 0.4)
 LOSSY = hg.erasure(hg.perfect(), 0.7)
+ROWS = {name: ([[1.0, 0.1 * i]], 0.3) for i, name in enumerate("abcde")}  # alike, and more than a program's
+RING = {name: ["abcde"[i - 1], "abcde"[i - 4]] for i, name in enumerate("abcde")}
 FUSIONS = {
     "rounds": hg.Fusion("own", TraceIntersection(), neighbours=RING, link=BURSTS, rounds=2),
     "best": hg.Fusion("own", MatrixWeights(), neighbours=RING, link=LOSSY),
@@ -22,7 +24,7 @@ def test_both_engines_have_the_same_numbers(monkeypatch):
 
     Where estimates nearly agree, best weights are those of a flat minimum: means to 1e-8, a condition of 5e7.
     """
-    world, records = hg.Network(PLANT, network({}).nodes, FUSIONS), {}
+    world, records = hg.Network(PLANT, network({}, RING, rows=ROWS).nodes, FUSIONS), {}
     for engine in ("native", "xla"):
         monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
         records[engine] = hg.monte_carlo(world, 30, 40, 5)

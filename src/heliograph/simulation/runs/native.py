@@ -265,7 +265,8 @@ def natively(
 def _is_apart(network: Network) -> bool:
     """Test whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory."""
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    return len(nodes) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in nodes)
+    fused = network.fused or network.meshes
+    return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
 
 
 def _parts(network: Network) -> Iterator[Network]:
