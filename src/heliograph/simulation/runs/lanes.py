@@ -35,9 +35,13 @@ class Lanes:
     """Carries of all lanes, and their advance over the blocks of a chunk.
 
     `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
+    `one_by_one`: programs that decompose large matrices, of which two at once wait for each other's threads forever.
     """
 
-    def __init__(self, alone: Advance, together: Advance, start: Callable[[], PyTree], first_run: int):
+    def __init__(
+        self, alone: Advance, together: Advance, start: Callable[[], PyTree], first_run: int, one_by_one: bool = False
+    ):
+        self.one_by_one = one_by_one
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
         self.wide = devices > 1 or not processor
@@ -62,7 +66,7 @@ class Lanes:
                 return to_numpy(recorded)
 
         if self.pool is None:
-            self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
+            self.pool = ThreadPoolExecutor(1 if self.one_by_one else min(self.count, os.cpu_count() or 1))
         return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
 
     def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
