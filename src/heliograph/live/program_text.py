@@ -28,7 +28,7 @@ class _Writer:
         self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
 
     def lines(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
-        """Return the lines of a program, whose variables are numbered in their order."""
+        """Return the lines of a program, its variables numbered in their order."""
         numbers: dict[Var, int] = {}
         head = [f"{self._defined(numbers, jaxpr.constvars)} = {[self._value(value) for value in consts]}"]
         head += [self._defined(numbers, jaxpr.invars)]

@@ -156,7 +156,7 @@ def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progre
             partial(_all_lanes, job),
             partial(_initial, job),
             first_run,
-            one_by_one=bool(job.world.filters.meshes),  # whose weights are of many estimates at once
+            one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
         )
         parts = in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
     collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding

@@ -44,7 +44,7 @@ def _one_by_one(moments: Moments) -> Moments:
 
 
 def _kernel(moments: Moments) -> Moments:
-    """Return a kernel of moments whose ends are arrays of one shape."""
+    """Return a kernel of moments between ends that are arrays of one shape."""
     return runs_last(moments, shapes=lambda *ends: TruncatedNormal(*[ends[0].shape] * 3), written=_one_by_one(moments))
 
 
