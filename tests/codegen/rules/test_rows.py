@@ -28,7 +28,7 @@ def test_what_has_one_row_or_fewer_axes_is_that_of_each_row(name):
     assert np.max(np.abs(computed - expected)) < 1e-14
 
 
-def test_a_table_beside_numbers_that_are_written_out_is_written_out_too():
+def test_a_table_with_numbers_that_are_written_out_is_written_out_too():
     """Of the upper triangle of x x', mirrored, only that is computed: of 9 numbers, 45 products and sums."""
 
     def mirrored(x):

@@ -28,12 +28,12 @@ def is_long(inputs: list[Value]) -> bool:
     """
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
     known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
-    return longest > LARGE or (longest > LONG and not (known and _are_known_or_many(inputs, longest)))
+    return longest > LARGE or (longest > LONG and not (known and _are_written_out(inputs, longest)))
 
 
-def _are_known_or_many(inputs: list[Value], many: int) -> bool:
+def _are_written_out(inputs: list[Value], count: int) -> bool:
     arrays = [x for x in inputs if not isinstance(x, InMemory)]
-    return any(x.size >= many for x in arrays) or all(
+    return any(x.size >= count for x in arrays) or all(
         isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist()
     )
 
