@@ -77,8 +77,8 @@ def worst_disturbance(
     sizes = (n,), (n,), (time, world.disturbance.shape[1]), (time, draws.noise.shape[-1])
     random, items = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
     points = Disturbance(*(s * random.normal(size=(len(items), *size)) for s, size in zip(FIRST, sizes, strict=True)))
-    found = hg.simulation.over_runs(_Climb(filter, world, draws, rounds), *points, items)
-    best = Disturbance(*(part[int(np.argmax(found.reached))] for part in found.disturbance))
+    climbed = hg.simulation.over_runs(_Climb(filter, world, draws, rounds), *points, items)
+    best = Disturbance(*(part[int(np.argmax(climbed.reached))] for part in climbed.disturbance))
     output = hg.simulation.over_runs(_Output(filter, world, best), *new_draws)
     with jax.enable_x64(True):
         energy = float(_energy(world, best))
