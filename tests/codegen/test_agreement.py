@@ -191,7 +191,8 @@ def test_numbers_of_the_data_choose_rows_of_tables_and_recordings():
     table = RANDOM.normal(size=(80, 2))
 
     def function(x, k):
-        return jnp.asarray(table)[k], x[k], jax.lax.dynamic_slice(x, (k,), (3,))
+        computed = 2 * x[:40].reshape(20, 2)  # 40 numbers, which are not in memory
+        return jnp.asarray(table)[k], x[k], jax.lax.dynamic_slice(x, (k,), (3,)), computed[k]
 
     x, k = RANDOM.normal(size=(11, 100)), RANDOM.integers(-120, 120, size=11)
     with jax.enable_x64(True):

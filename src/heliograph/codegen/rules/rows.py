@@ -22,15 +22,20 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Return whether nodes for all entries of an argument would be too many; those of tables alone are constants."""
+    """Return whether nodes for all entries of an argument would be too many.
+
+    Those of tables are constants: they are no more where the other arguments are known too, or are as many nodes.
+    """
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
     known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
-    return longest > LARGE or (longest > LONG and not (known and _are_known(inputs)))
+    return longest > LARGE or (longest > LONG and not (known and _are_written_out(inputs, longest)))
 
 
-def _are_known(inputs: list[Value]) -> bool:
-    arrays = (x for x in inputs if not isinstance(x, InMemory))
-    return all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
+def _are_written_out(inputs: list[Value], count: int) -> bool:
+    arrays = [x for x in inputs if not isinstance(x, InMemory)]
+    return any(x.size >= count for x in arrays) or all(
+        isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist()
+    )
 
 
 def _of_entries(name: str) -> Rule:

@@ -77,28 +77,6 @@ def _empty(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
     return [lowering.known(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
 
-def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Slice one axis after another, each start clamped so that the slice lies inside."""
-    x = inputs[0]
-    for axis, (start, size) in enumerate(zip(inputs[1:], equation.params["slice_sizes"], strict=True)):
-        x = window(lowering.graph, x, axis, lowering.scalar(start), size)
-    return [x]
-
-
-def window(graph: Graph, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
-    """Return `size` entries along an axis from a start that may depend on data."""
-    last = x.shape[axis] - size
-    if last == 0:
-        return x
-    if start.op == "constant":
-        first = min(max(int(start.value), 0), last)
-        return x[(slice(None),) * axis + (slice(first, first + size),)]
-    if last >= FEW:
-        raise Unsupported(f"one of {last + 1} places that data decide")
-    cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
-    return chosen(graph, start, cases)
-
-
 def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
     """One of several arrays, the first for numbers below 0 and the last for numbers beyond."""
     from heliograph.codegen.rules.elementwise import select
@@ -151,5 +129,5 @@ RULES |= {
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack,
     "unstack": _unstack, "pad": _pad,
     "iota": _iota, "empty": _empty, "empty2": _empty,
-    "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip

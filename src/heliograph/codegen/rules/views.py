@@ -12,7 +12,7 @@ from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.nodes import Buffer, Key, Node
 from heliograph.codegen.rules.elementwise import PASSED_ON
 from heliograph.codegen.rules.loops import copied, in_memory, repeated
-from heliograph.codegen.rules.shapes import FEW
+from heliograph.codegen.rules.shapes import FEW, chosen
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
@@ -76,6 +76,26 @@ def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) 
         else:
             moves.append((x.strides[axis], first))
     return [x.view(sizes, x.strides, offset, *moves)]
+
+
+def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Value]:
+    """Slice one axis after another, each start clamped so that the slice lies inside; from memory if it may be many."""
+    x, sizes, starts = inputs[0], equation.params["slice_sizes"], [lowering.scalar(x) for x in inputs[1:]]
+    for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
+        last = x.shape[axis] - size
+        if start.op != "constant" and last >= FEW:
+            return _dynamic_slice(lowering, equation, [in_memory(lowering, inputs[0]), *inputs[1:]])
+        x = _window(lowering, x, axis, start, size) if last else x
+    return [x]
+
+
+def _window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
+    """Return `size` entries along an axis from a start that may depend on data."""
+    last = x.shape[axis] - size
+    cases = [x[(slice(None),) * axis + (slice(first, first + size),)] for first in range(last + 1)]
+    return (
+        cases[min(max(int(start.value), 0), last)] if start.op == "constant" else chosen(lowering.graph, start, cases)
+    )
 
 
 def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
@@ -176,5 +196,6 @@ VIEWS: dict[str, View] = {
     "expand_dims": _reshape, "broadcast_in_dim": _broadcast,
 }  # fmt: skip
 IN_MEMORY |= {name: _viewed(name, view) for name, view in VIEWS.items()}
+RULES |= {"dynamic_slice": _dynamic_slice_of_nodes}
 IN_MEMORY |= {"split": _split, "dynamic_slice": _dynamic_slice, "gather": _gather, "concatenate": _concatenate}
 IN_MEMORY |= {name: RULES[name] for name in PASSED_ON}

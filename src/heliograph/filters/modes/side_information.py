@@ -1,6 +1,6 @@
 """Filters with side information on the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -109,12 +109,12 @@ class SideInformationFilter(AbstractSizedFilter):
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        square = padded(jnp.asarray(start.initial_covariance)).at[-1, -1].set(1.0)
-        unit = jnp.zeros(len(square)).at[-1].set(1.0)
+        modes, unit = len(law), jnp.zeros(len(self.states) + 1).at[-1].set(1.0)
         expected = jnp.kron(law, unit)
-        known = jnp.outer(expected, unit)  # s = known x~
-        r = _stacked(jnp.eye(len(square)), known, _deviations(len(law), len(square)) - known)
-        moments = law[:, None, None] * (r @ square @ r.swapaxes(1, 2))
+        # E[r | mode], of which x alone varies.
+        known = [jnp.concatenate([unit, expected, jnp.kron(of_mode - law, unit)]) for of_mode in np.eye(modes)]
+        moments = _of_state(padded(jnp.asarray(start.initial_covariance)), modes)
+        moments = law[:, None, None] * (moments + jnp.stack([jnp.outer(r, r) for r in known]))
         return SideInformationBelief(jnp.asarray(start.initial_mean), expected, moments, jnp.asarray(False))
 
     @predicts
@@ -124,18 +124,17 @@ class SideInformationFilter(AbstractSizedFilter):
         move, noise, centre = moved_about(plant, u, state.centre)
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
-        # F acts on s and on e, A~ on x~.
         step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
-        whole = jax.scipy.linalg.block_diag(move, step, step)
-        # (1_j - p_i) x A~ x~: the random transition of the mode, which enters the error.
-        chosen = jnp.einsum("ijl,ab->ijlab", jnp.eye(modes) - rows[:, None], jnp.eye(size))
-        change = jnp.broadcast_to(jnp.eye(len(whole)), (modes, modes, *whole.shape))
-        change = change.at[:, :, -len(step) :, :size].set(chosen.reshape(modes, modes, -1, size))
-        carried = _turned(change @ whole, state.moments[:, None], len(step))
-        # Process noise, in x~ and in the error of mode j.
-        fresh = _stacked(jnp.eye(size), jnp.zeros((len(step), size)), _deviations(modes, size))
-        moments = jnp.einsum("ij,ijab->jab", rows, carried)
-        moments = moments + (law @ rows)[:, None, None] * (fresh @ noise @ fresh.swapaxes(1, 2))
+        carried = _carried(_mirrored(state.moments), move[:-1, :-1], rows)
+        # e in mode j: F e + (1_j - p_i) x A~ x~, with the random transition of the mode.
+        chosen = jnp.eye(modes) - rows[:, None]
+        moments = _with_transition(carried, rows, chosen) + (law @ rows)[:, None, None] * _of_state(noise, modes)
+        # The rounding of these products.
+        reach = _deviation(state.moments).reshape(modes, -1, size) @ jnp.abs(move).T
+        error = jnp.einsum("lj,ila->ija", rows, reach[:, 1 + modes :])
+        reached = jnp.abs(chosen)[..., None] * reach[:, None, None, 0] + error[:, None]
+        rounded = jnp.einsum("ij,ijla->jla", rows, reached**2).reshape(modes, -1)
+        moments = _with_rounding(moments, rounded)
         return SideInformationBelief(centre, step @ state.mean, moments, jnp.asarray(True))
 
     @corrects
@@ -153,8 +152,8 @@ class SideInformationFilter(AbstractSizedFilter):
         weight = jnp.asarray(known.chance)[:, kind] * spelled
         size = len(self.states) + 1
         # Moments given the side information, and the best s under them.
-        total = weight @ state.moments[:, size - 1, size - 1]
-        moments = weight[:, None, None] * state.moments / total
+        weight = weight / (weight @ state.moments[:, size - 1, size - 1])
+        moments = weight[:, None, None] * _mirrored(state.moments)
         prior = _projected(state._replace(moments=moments), size)
         # Kalman update of zeta with the components that arrived, and the rounding of the mean.
         after, value, covariance, precise = _used(
@@ -181,28 +180,60 @@ class SideInformationFilter(AbstractSizedFilter):
         )
 
 
-def _deviations(modes: int, size: int) -> jax.Array:
-    """zeta = 1_i x x~ in mode i, as matrices (M, M (n + 1), n + 1)."""
-    return jnp.einsum("il,ab->ilab", jnp.eye(modes), jnp.eye(size)).reshape(modes, modes * size, size)
+def _mirrored(moments: jax.Array) -> jax.Array:
+    """Moments (M, r, r) that are symmetric but for rounding, of their upper triangle: half of the products is done."""
+    return jnp.where(np.triu(np.ones(moments.shape[1:], bool)), moments, moments.swapaxes(1, 2))
 
 
-def _stacked(x: jax.Array, s: jax.Array, e: jax.Array) -> jax.Array:
-    """r = (x~, s, e) as a matrix for each mode, where x~ and s are the same in all."""
-    both = jnp.concatenate([x, s])
-    return jnp.concatenate([jnp.broadcast_to(both, (len(e), *both.shape)), e], axis=1)
+def _of_state(covariance: jax.Array, modes: int) -> jax.Array:
+    """E[r r'] in each mode (M, r, r) of what x~ gains, with this covariance: in x~ and in e of the mode."""
+    gains = np.zeros((modes, 1 + 2 * modes), bool)
+    gains[:, 0], gains[:, 1 + modes :] = True, np.eye(modes)
+    there = np.kron(gains[:, :, None] & gains[:, None, :], np.ones(covariance.shape, bool))
+    return jnp.where(there, jnp.tile(covariance, (gains.shape[1],) * 2), 0.0)
 
 
-def _turned(change: jax.Array, moments: jax.Array, errors: int) -> jax.Array:
-    """F E[r r'] F' (..., r, r), and of each of the last variances, the errors', the rounding of these products."""
-    turned = change @ moments @ jnp.swapaxes(change, -1, -2)
-    rounded = _rounding(jnp.abs(change[..., -errors:, :]), moments)
-    return turned.at[..., -errors:, -errors:].add(jnp.eye(errors) * rounded[..., None])
+def _carried(moments: jax.Array, transition: jax.Array, rows: jax.Array) -> jax.Array:
+    """E[r r'] (M, r, r) with each x~ in r moved by A~ = diag(A, 1), those in s and in e then mixed by the chain."""
+    modes, n = len(rows), len(transition)
+
+    def act(columns: jax.Array) -> jax.Array:
+        parts = columns.reshape(modes, -1, n + 1, columns.shape[-1])
+        moved = jnp.concatenate([jnp.einsum("ab,itbc->itac", transition, parts[:, :, :n]), parts[:, :, n:]], axis=2)
+        apart = moved[:, 1:].reshape(modes, 2, modes, -1)
+        mixed = jnp.einsum("lj,itlc->itjc", rows, apart).reshape(modes, 2 * modes, n + 1, -1)
+        return jnp.concatenate([moved[:, :1], mixed], axis=1).reshape(columns.shape)
+
+    return _turned(moments, act)
 
 
-def _rounding(size: jax.Array, moments: jax.Array) -> jax.Array:
-    """Four eps of (|F| d)^2, d the deviations (..., m): what the products of F E[r r'] F' may be off."""
-    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(moments, axis1=-2, axis2=-1), 0.0))
-    return 4 * float(np.finfo(moments.dtype).eps) * (size @ deviation[..., None])[..., 0] ** 2
+def _with_transition(moments: jax.Array, rows: jax.Array, chosen: jax.Array) -> jax.Array:
+    """E[r r'] in each next mode j, sum_i Pi_ij E[r r' | i], where e gains c_ij x x~, c = `chosen` (M, M, M)."""
+    modes, size = len(rows), moments.shape[1] // (1 + 2 * len(rows))
+    weights, errors = rows[:, :, None] * chosen, slice(-modes * size, None)
+    squares = weights[..., None] * chosen[:, :, None]
+    cross = jnp.einsum("ijl,iab->jlab", weights, moments[:, :size]).reshape(modes, modes * size, -1)
+    square = jnp.einsum("ijlm,iab->jlamb", squares, moments[:, :size, :size]).reshape(modes, modes * size, -1)
+    of_next = jnp.einsum("ij,iab->jab", rows, moments)
+    of_next = of_next.at[:, :, errors].add(cross.swapaxes(1, 2)).at[:, errors].add(cross)
+    return _mirrored(of_next.at[:, errors, errors].add(square))
+
+
+def _turned(moments: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
+    """F E[r r'] F' (M, r, r), where `act` is the product of F with columns (M, r, c)."""
+    return _mirrored(act(act(moments).swapaxes(1, 2)))
+
+
+def _deviation(moments: jax.Array) -> jax.Array:
+    """Deviations (..., r)."""
+    return jnp.sqrt(jnp.maximum(jnp.diagonal(moments, axis1=-2, axis2=-1), 0.0))
+
+
+def _with_rounding(moments: jax.Array, squares: jax.Array) -> jax.Array:
+    """Add to the last variances, the errors', four eps of (|F| d)^2, d the deviations: the products' F E[r r'] F'."""
+    count = squares.shape[-1]
+    rounded = 4 * float(np.finfo(moments.dtype).eps) * squares
+    return moments.at[..., -count:, -count:].add(jnp.where(np.eye(count, dtype=bool), rounded[..., None], 0.0))
 
 
 def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
@@ -214,9 +245,15 @@ def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief
     count, total = len(state.mean), jnp.sum(state.moments, axis=0)
     known = slice(size - 1, size + count)
     change = pseudo_solve(total[known, known], total[known, -count:], rounding(PRECISE, total, 1000)).T
-    turn = jnp.eye(len(total)).at[size:-count, known].add(change).at[-count:, known].add(-change)
-    moments = _turned(turn, state.moments, count)
-    return state._replace(mean=state.mean + change @ jnp.append(1.0, state.mean), moments=moments)
+
+    def act(r: jax.Array) -> jax.Array:
+        gained = change @ r[:, known]
+        return jnp.concatenate([r[:, :size], r[:, size:-count] + gained, r[:, -count:] - gained], axis=1)
+
+    moments, deviation = _turned(state.moments, act), _deviation(state.moments)
+    reach = deviation[:, -count:] + deviation[:, known] @ jnp.abs(change).T
+    mean = state.mean + change @ jnp.append(1.0, state.mean)
+    return state._replace(mean=mean, moments=_with_rounding(moments, reach**2))
 
 
 def _used(
@@ -243,13 +280,18 @@ def _used(
     # S = H P H' + sum_j Cov(z | zeta, j), K = P H' S^-1, with the rounding of S, which no difference of modes is below.
     cross, value = output @ prior, z - common - output @ state.mean
     total = cross @ output.T + jnp.sum(added, axis=0)
-    rounded = jnp.diag(_rounding(jnp.abs(output), prior))
-    seen = jnp.where(there[:, None] & there, symmetrize(total) + rounded, 0.0) + absent(there)
+    rounded = _with_rounding(symmetrize(total), (jnp.abs(output) @ _deviation(prior)) ** 2)
+    seen = jnp.where(there[:, None] & there, rounded, 0.0) + absent(there)
     gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
-    both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
     # s+ = s + K (H e + noise), e+ = e - K (H e + noise).
-    change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ output)
-    moments = _turned(change, state.moments, len(prior))
+    count, left = len(prior), jnp.eye(len(prior)) - gain @ output
+
+    def act(r: jax.Array) -> jax.Array:
+        e = r[:, -count:]
+        return jnp.concatenate([r[:, :size], r[:, size:-count] + gain @ (output @ e), left @ e], axis=1)
+
+    reach = _deviation(state.moments)[:, -count:] @ jnp.abs(left).T
+    moments = _with_rounding(_turned(state.moments, act), reach**2)
     noise_of = jax.vmap(spread_of, in_axes=(None, 0))(gain, added)
     moments = moments.at[:, size:, size:].add(jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), noise_of))
     after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
