@@ -45,8 +45,10 @@ def test_in_steps_it_is_the_smoother_of_the_rows():
     assert timeline.save() == before
 
 
-def test_in_continuous_time_it_is_the_conditional_law():
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_in_continuous_time_it_is_the_conditional_law(engine, monkeypatch):
     """Brownian motion x from a random start, Cov(x_s, x_t) = P0 + q min(s, t), measured with noise R at odd moments."""
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", engine)
     start, q, r = 2.0, 0.3, 0.1
     plant = hg.Plant(lambda x, u: x, lambda u: q * jnp.diag(u), [0.5], start, inputs=["dt"])
     sensor = hg.LinearSensor([[1.0]], r)

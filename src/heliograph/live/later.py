@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
@@ -51,7 +52,8 @@ class History(NamedTuple):
 
     def interval(self, row: jax.Array, dt: int) -> jax.Array:
         """Return the inputs of a plant of continuous time since the row before, as held then."""
-        return jnp.insert(self.held[row - 1], dt, self.parts(row)[2] - self.parts(row - 1)[2])
+        held, passed = self.held[row - 1], self.parts(row)[2] - self.parts(row - 1)[2]
+        return jnp.concatenate([held[:dt], passed[None], held[dt:]])
 
     def at_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return measurements and inputs at step k, which is the row's or one between it and the row before."""
@@ -146,7 +148,8 @@ def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
         _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
         return sweep.outputs(steps, later)
 
-    return jax.jit(run, compiler_options=understood())
+    by_xla = jax.jit(run, compiler_options=understood())
+    return lambda *arguments: computed(run, by_xla, arguments)
 
 
 def _into_row(dt: int) -> Into:

@@ -77,32 +77,41 @@ def worst_disturbance(
     sizes = (n,), (n,), (time, world.disturbance.shape[1]), (time, draws.noise.shape[-1])
     random, items = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
     points = Disturbance(*(s * random.normal(size=(len(items), *size)) for s, size in zip(FIRST, sizes, strict=True)))
+    climbed = hg.simulation.over_runs(_Climb(filter, world, draws, rounds), *points, items)
+    best = Disturbance(*(part[int(np.argmax(climbed.reached))] for part in climbed.disturbance))
+    output = hg.simulation.over_runs(_Output(filter, world, best), *new_draws)
     with jax.enable_x64(True):
-        result, reached = jax.tree.map(np.asarray, _climb(filter, world, draws, points, items, rounds))
-        best = Disturbance(*(part[int(np.argmax(reached))] for part in result))
-        output = np.asarray(_output_energy(filter, world, new_draws, best))
         energy = float(_energy(world, best))
     ratio = output / energy
     level = float(np.sqrt(ratio.mean()))
     return Worst(level, float(ratio.std(ddof=1) / np.sqrt(len(ratio)) / (2 * level)), best)
 
 
-@eqx.filter_jit
-def _climb(
-    filter: hg.filters.AbstractFilter,
-    world: World,
-    draws: Draws,
-    points: Disturbance,
-    energies: np.ndarray,
-    rounds: int,
-) -> tuple[Disturbance, jax.Array]:
-    """Points of each energy and the ratios reached."""
+class Climbed(NamedTuple):
+    """Where a climb ends, and the ratio reached."""
 
-    @jax.jit  # traced once for its value and its gradient
-    def gained(w: Disturbance) -> jax.Array:
-        return jnp.mean(_output_energy(filter, world, draws, w))
+    disturbance: Disturbance
+    reached: jax.Array | np.ndarray
 
-    def single(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
+
+class _Climb(Module):
+    """The climb from one disturbance of one energy; draw after draw, so that a program has the filter's step once."""
+
+    filter: hg.filters.AbstractFilter
+    world: World
+    draws: Draws
+    rounds: int = eqx.field(static=True)
+
+    def __call__(
+        self, state: jax.Array, error: jax.Array, plant: jax.Array, channel: jax.Array, energy: jax.Array
+    ) -> Climbed:
+        world = self.world
+
+        @jax.jit  # traced once for its value and its gradient
+        def gained(w: Disturbance) -> jax.Array:
+            drawn = jnp.asarray(self.draws.gain), jnp.asarray(self.draws.noise)
+            return jnp.mean(jax.lax.map(lambda draw: _Output(self.filter, world, w)(*draw), drawn))
+
         def improve(w: Disturbance, _: None) -> tuple[Disturbance, jax.Array]:
             # The gradient of E sum |M e|^2 at the same energy, and the best point on the way there.
             uphill = _scaled(world, _raised(world, jax.grad(gained)(w)), energy)
@@ -111,11 +120,9 @@ def _climb(
             best = jnp.argmax(values)
             return jax.tree.map(lambda leaf: leaf[best], tries), values[best]
 
-        w, values = jax.lax.scan(improve, _scaled(world, point, energy), None, length=rounds)
-        return w, values[-1] / energy
-
-    result: tuple[Disturbance, jax.Array] = jax.vmap(single)(points, jnp.asarray(energies))
-    return result
+        start = _scaled(world, Disturbance(state, error, plant, channel), energy)
+        w, values = jax.lax.scan(improve, start, None, length=self.rounds)
+        return Climbed(w, values[-1] / energy)
 
 
 def _between(a: Disturbance, b: Disturbance, share: jax.Array) -> Disturbance:
@@ -142,11 +149,16 @@ def _raised(world: World, gradient: Disturbance) -> Disturbance:
     return gradient._replace(state=state, error=error)
 
 
-@eqx.filter_jit
-def _output_energy(filter: hg.filters.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
-    """sum |M e|^2 for each draw, (draw,)."""
+class _Output(Module):
+    """sum |M e|^2 of one draw."""
 
-    def single(gains: jax.Array, noises: jax.Array) -> jax.Array:
+    filter: hg.filters.AbstractFilter
+    world: World
+    disturbance: Disturbance
+
+    def __call__(self, gains: jax.Array, noises: jax.Array) -> jax.Array:
+        filter, world, w = self.filter, self.world, self.disturbance
+
         def step(carry: PyTree, item: PyTree) -> tuple[PyTree, jax.Array]:
             x, state = carry
             k, u, v, rho, gain, noise = item
@@ -156,11 +168,8 @@ def _output_energy(filter: hg.filters.AbstractFilter, world: World, draws: Draws
             return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
 
         begin = _from(filter, jnp.asarray(w.state - w.error))
-        items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
-        return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
-
-    result: jax.Array = jax.vmap(single)(jnp.asarray(draws.gain), jnp.asarray(draws.noise))
-    return result
+        items = jnp.arange(len(gains)), jnp.asarray(world.inputs), w.plant, w.channel, gains, noises
+        return jnp.sum(jax.lax.scan(step, (jnp.asarray(w.state), begin), items)[1])
 
 
 def _from(filter: hg.filters.AbstractFilter, mean: jax.Array) -> PyTree:
