@@ -118,8 +118,8 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
     # Of several matrices one after another.
     program, matrices = _program(shape[-1]), lowering.nodes(inputs[0]).reshape(-1, *shape[-2:])
-    each = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in matrices]
-    return [np.stack(x).reshape(*shape[:-2], *x[0].shape) for x in zip(*each, strict=True)]
+    solved = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in matrices]
+    return [np.stack(x).reshape(*shape[:-2], *x[0].shape) for x in zip(*solved, strict=True)]
 
 
 @cache
