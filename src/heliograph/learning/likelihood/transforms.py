@@ -36,6 +36,7 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
 
 def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
     """Number at a point of the line, in operations that JAX traces; of an interval's plain number a plain one."""
+    # Simplexes and covariances.
     if domain.kind == "simplex":
         rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
         weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
@@ -45,6 +46,7 @@ def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
         factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
         factor = jnp.where(np.eye(shape[0], dtype=bool), jnp.exp(jnp.diag(jnp.diag(factor))), factor)
         return factor @ factor.T
+    # Intervals.
     xp = library(x)
     value: Array = xp.reshape(x, shape)
     if np.isfinite(domain.low) and np.isfinite(domain.high):
