@@ -77,7 +77,7 @@ def test_cross_covariances_are_those_of_the_stacked_problem(seed):
 @pytest.fixture(scope="module")
 def world():
     """Five nodes, each with a second filter that trusts the mean gain and starts where it likes; every rule."""
-    plant, parts = random_case(11, nodes=5)
+    plant, parts = random_case(11, nodes=5, n=2)
     nodes = {
         name: hg.Node(
             node.sensor,
@@ -122,7 +122,7 @@ def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     groups = {"a": [0, 3], "b": [1, 2, 4]}
     leaves = hg.simulation.cross_covariances(world, "local", 6)
     level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
-    by_hand = np.zeros((2, 3, 5, 3))
+    by_hand = np.zeros((2, 2, 5, 2))
     for r, mine in enumerate(groups.values()):
         by_hand[r][:, mine] = hg.fusion.MatrixWeights().weights(leaves.joint[mine][:, :, mine])
     joint = np.einsum("raib,ibjc,sdjc->rasd", by_hand, leaves.joint, by_hand)
@@ -155,7 +155,7 @@ def along_and_linear(plant, parts):
 def test_losses_that_are_said_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
-    fused = hg.run(along_and_linear(*random_case(7, nodes=2)), z).estimates["fused"]
+    fused = hg.run(along_and_linear(*random_case(7, nodes=2, n=2)), z).estimates["fused"]
     np.testing.assert_allclose(fused["local matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
@@ -220,7 +220,7 @@ def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
 
     The spread of a gain times the square of the signal is all that differs: 1e-10 of variance.
     """
-    plant, parts = random_case(2, nodes=2)
+    plant, parts = random_case(2, nodes=2, n=2)
     net = along_and_linear(plant, [(c, r, mean, 1e-10, noise) for c, r, mean, _, noise in parts])
     draw = np.random.default_rng(0)
     data = {name: draw.normal(size=(6, node.received)) for name, node in net.nodes.items()}
@@ -239,9 +239,9 @@ def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
 @pytest.mark.slow
 def test_a_large_tree_is_the_small_one():
     """Eleven leaves in a tree of degree three, made of numbers: every level as relays of named nodes give it."""
-    plant, _ = random_case(4)
+    plant, _ = random_case(4, n=2)
     draw = np.random.default_rng(1)
-    numbers = {"output": draw.normal(size=(11, 1, 3)), "noise": 0.1 + draw.random(11)}
+    numbers = {"output": draw.normal(size=(11, 1, 2)), "noise": 0.1 + draw.random(11)}
 
     def leaf(item):
         sensor, channel = hg.LinearSensor(item["output"], 0.2), hg.hop(two_gains(0.8, 0.05), noise=item["noise"])

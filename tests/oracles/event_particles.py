@@ -63,5 +63,5 @@ def particle_moments(problem: Problem, z: np.ndarray, count: int, seed: int) -> 
         ends = np.ceil(np.cumsum(weight) * count - random.random()).astype(int)
         ends[-1] = count
         chosen = np.repeat(np.arange(count), np.diff(ends, prepend=0))
-        x, mode, reference, age = x[:, chosen], mode[chosen], reference[chosen], age[chosen]
+        x, mode, reference, age = (np.take(values, chosen, axis=-1) for values in (x, mode, reference, age))
     return np.array(means), np.array(covariances)

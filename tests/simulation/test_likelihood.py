@@ -76,18 +76,25 @@ FILTERS = {
 }
 
 
+def by_jit(function, *arguments):
+    """As `over_runs`, by JAX's compiler."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.jit(jax.vmap(function))(*arguments))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FILTERS)
-def test_gradients_are_finite_differences(name):
+@pytest.mark.parametrize(
+    ("name", "over"), zip(FILTERS, (hg.simulation.over_runs, by_jit, hg.simulation.over_runs), strict=True)
+)
+def test_gradients_are_finite_differences(name, over):
+    """By either engine."""
     item, step = FILTERS[name], 1e-5
 
     def likelihood(q, z):
         return hg.log_likelihood(eqx.tree_at(lambda f: f.plant.noise.covariance, item, q), z, INPUTS)
 
-    slope = jax.jit(jax.grad(likelihood))
-    for z in (data(False), data(True)):
-        with jax.enable_x64(True):
-            gradient = np.asarray(slope(jax.numpy.asarray(Q), jax.numpy.asarray(z)))
+    both = np.stack([data(False), data(True)])
+    for z, gradient in zip(both, over(jax.grad(likelihood), np.stack([Q, Q]), both), strict=True):
         for direction in (np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])):
             difference = (likelihood(Q + step * direction, z) - likelihood(Q - step * direction, z)) / (2 * step)
             assert np.sum(gradient * direction) == pytest.approx(difference, rel=1e-6)

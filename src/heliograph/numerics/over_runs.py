@@ -30,6 +30,7 @@ class _Kernel:
         # Traced once per shapes, however many filters use it.
         self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
         self.source = source
+        self.sloped = jax.jit(partial(_sloped, source), static_argnums=(0, 1), inline=True)
         self.written = jax.jit(lambda args, kwargs: written(*args, **kwargs))
 
     def __repr__(self) -> str:
@@ -139,16 +140,30 @@ def _with_tangents(
     **rest: Any,
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Derivatives in what has tangents; of the rest nothing is computed."""
-    moves = [not isinstance(t, ad.Zero) for t in tangents]
-
-    @wraps(kernel.source)
-    def source(*moving: jax.Array) -> list[jax.Array]:
-        items = iter(moving)
-        args, kwargs = jax.tree.unflatten(tree, [next(items) if m else x for m, x in zip(moves, primals, strict=True)])
-        return _for_each(jax.tree.leaves(kernel.source(*args, **kwargs)), declared, runs)
-
+    moves = tuple(not isinstance(t, ad.Zero) for t in tangents)
     at, along = (tuple(x for m, x in zip(moves, values, strict=True) if m) for values in (primals, tangents))
-    results, slopes = jax.jvp(source, at, along)
+    fixed = tuple(x for m, x in zip(moves, primals, strict=True) if not m)
+    results, slopes = kernel.sloped(tree, moves, at, along, fixed)
+    return _for_each(results, declared, runs), _for_each(slopes, declared, runs)
+
+
+def _sloped(
+    source: Callable[..., PyTree],
+    tree: Any,
+    moves: tuple[bool, ...],
+    at: tuple[jax.Array, ...],
+    along: tuple[jax.Array, ...],
+    fixed: tuple[jax.Array, ...],
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Results and derivatives of a kernel's arithmetic, traced once per shapes and arguments that move."""
+
+    @wraps(source)
+    def of_moving(*moving: jax.Array) -> list[jax.Array]:
+        items, others = iter(moving), iter(fixed)
+        args, kwargs = jax.tree.unflatten(tree, [next(items if m else others) for m in moves])
+        return jax.tree.leaves(source(*args, **kwargs))
+
+    results, slopes = jax.jvp(of_moving, at, along)
     return results, slopes
 
 

@@ -27,6 +27,7 @@ from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.shared_fading import deliver, memory_places, start
+from heliograph.simulation.side_by_side import over_all
 
 ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -101,8 +102,9 @@ class SeparateChannels(AbstractMedium):
             sender = None if group.trigger is None else group.trigger.start(outputs)
             return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back, sender)
 
-        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))
-        return tuple(() if isinstance(group, Silent) else both(group) for group in self.groups)
+        return tuple(
+            () if isinstance(group, Silent) else over_all(single, len(group.checksums))(group) for group in self.groups
+        )
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
@@ -129,9 +131,10 @@ class SeparateChannels(AbstractMedium):
             sender, z = group.trigger.transmit(sender, y, z, drawn, k)
             return LinkState(memory, reach.feed_back, sender), z
 
-        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0))
         results = [
-            (reach, jnp.zeros((group.count, 0))) if isinstance(group, Silent) else both(group, reach)
+            (reach, jnp.zeros((group.count, 0)))
+            if isinstance(group, Silent)
+            else over_all(single, len(group.checksums))(group, reach)
             for group, reach in zip(self.groups, state, strict=True)
         ]
         return tuple(after for after, _ in results), tuple(z for _, z in results)

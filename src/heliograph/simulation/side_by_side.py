@@ -1,6 +1,7 @@
 """Filters of one kind in parallel: stacked along axes of filters and nodes, and vmapped."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -103,7 +104,7 @@ class Alike(Module):
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
-        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0)))
+        both = over_all(single, self.count * self.nodes)
         after, known = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), known)
 
@@ -113,8 +114,7 @@ class Alike(Module):
         """Apply `read` to this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        read_all = eqx.filter_vmap(lambda node, state, z: read(node, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
-        return read_all(filters, states, z)
+        return over_all(lambda node, state, z: read(node, state, z, u, k), self.nodes)(filters, states, z)
 
 
 def started(filter: AbstractFilter) -> PyTree:
@@ -123,6 +123,21 @@ def started(filter: AbstractFilter) -> PyTree:
 
 
 def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
-    """Vectorise a function of one of what is stacked; some hold no array from which the number could be read."""
+    """Vectorise a function of one of what is stacked; some hold no array from which the number could be read.
+
+    A single one is not vectorised: its function takes half as long to trace as the same over one axis more.
+    """
+    if size == 1:
+        return partial(_of_one, function)
     over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
     return over
+
+
+def _of_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
+    def only(leaf: PyTree) -> PyTree:
+        return jax.lax.squeeze(leaf, (0,)) if eqx.is_array(leaf) else leaf
+
+    def alone(leaf: PyTree) -> PyTree:
+        return jax.lax.expand_dims(leaf, (0,)) if eqx.is_array(leaf) else leaf
+
+    return jax.tree.map(alone, function(*jax.tree.map(only, stacked)))

@@ -114,9 +114,12 @@ def _exchange(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
-    if len(shape) != 2 or shape[0] > LARGEST or equation.params.get("subset_by_index") is not None:
+    if shape[-1] > LARGEST or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    return lowering.inline(_program(shape[0]), inputs)
+    # Of several matrices one after another.
+    program, matrices = _program(shape[-1]), lowering.nodes(inputs[0]).reshape(-1, *shape[-2:])
+    solved = [[lowering.nodes(x) for x in lowering.inline(program, [matrix])] for matrix in matrices]
+    return [np.stack(x).reshape(*shape[:-2], *x[0].shape) for x in zip(*solved, strict=True)]
 
 
 @cache

@@ -16,7 +16,7 @@ from heliograph.codegen.nodes import Key, Node, Type, Unsupported
 ELEMENTWISE = {name: name for name in (
     "add", "sub", "mul", "div", "rem", "neg", "abs", "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan",
     "tanh", "atan2", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
-    "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "digamma", "asin", "acos", "atan",
+    "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "asin", "acos", "atan",
     "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "nextafter",
 )} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
 

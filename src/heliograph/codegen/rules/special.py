@@ -1,6 +1,7 @@
-"""Rules of the incomplete gamma functions: a power series below the law's mean, a continued fraction above it."""
+"""Rules of special functions by their series: incomplete gamma functions, Bessel functions, the digamma function."""
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -12,6 +13,8 @@ from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
 from heliograph.codegen.nodes import Unsupported
 
 EPSILON = float(np.finfo(np.float64).eps)
+FAR = 30.0  # the argument of a Bessel function from which its asymptotic series has all digits
+BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160]  # B_2n / (2 n)
 TINY = float(np.finfo(np.float64).tiny) / EPSILON
 Fraction = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
 
@@ -59,21 +62,78 @@ def _apart(x: jax.Array) -> jax.Array:
     return jnp.where(x == 0, TINY, x)
 
 
+def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
+    """Compute e^-|x| I_0(x) or e^-|x| I_1(x): a power series up to |x| = 30, beyond it the asymptotic one.
+
+    I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); of v = 0 and 1 it is e^x / root(2 pi x) (1 + sum_k a_k) with
+    a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), whose terms fall to 1e-26 at 30.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
+    """
+    size = jnp.abs(x)
+    large = size > FAR
+
+    def add(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        k, term, total = state
+        near = size * size / (4 * k * (k + order))
+        ratio = jnp.where(large, ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(large, size, 1.0)), near)
+        return k + 1, term * ratio, total + term * ratio
+
+    first = jnp.where(large | (order == 0), 1.0, size / 2)
+    total = jax.lax.while_loop(lambda s: jnp.abs(s[1]) > EPSILON / 8 * s[2], add, (jnp.ones_like(x), first, first))[2]
+    scale = jnp.where(large, 1 / jnp.sqrt(2 * np.pi * jnp.where(large, size, 1.0)), jnp.exp(-size))
+    value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
+    return jnp.where(x < 0, -value, value) if order else value
+
+
+def digamma(x: jax.Array) -> jax.Array:
+    """Compute the derivative of log Gamma(x): at 10 and more from its asymptotic series, to which a recurrence leads.
+
+    psi(x) = psi(x + 1) - 1 / x = log x - 1 / (2 x) - sum_n B_2n / (2 n x^2n), psi(x) = psi(1 - x) - pi / tan(pi x).
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.3.5, 6.3.7 and 6.3.18.
+    """
+    mirrored = x <= 0
+    at = jnp.where(mirrored, 1 - x, x)
+    passed = jnp.zeros_like(x)
+    for _ in range(10):
+        low = at < 10
+        passed, at = passed + jnp.where(low, 1 / at, 0.0), jnp.where(low, at + 1, at)
+    square, tail = 1 / (at * at), jnp.zeros_like(x)
+    for coefficient in BERNOULLI[::-1]:
+        tail = (tail + coefficient) * square
+    value = jnp.log(at) - 0.5 / at - tail - passed
+    nearest = x - jnp.round(x)
+    turned = np.pi / jnp.tan(np.pi * jnp.where(nearest == 0, 1.0, nearest))
+    pole = jnp.where(x == 0, -1 / x, jnp.where(nearest == 0, jnp.nan, value - turned))
+    return jnp.where(mirrored, pole, value)
+
+
 def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    avals: list[Any] = [v.aval for v in equation.invars]
-    if avals[0].dtype != np.float64:
-        raise Unsupported(f"incomplete gamma functions of numbers of type {avals[0].dtype}")
-    both = lowering.inline(_program(avals[0].shape), inputs)
+    both = _inlined(gamma_masses, lowering, equation, inputs)
     return [both[equation.primitive.name == "igammac"]]
 
 
+def _inlined(function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    avals: list[Any] = [v.aval for v in equation.invars]
+    if avals[0].dtype != np.float64:
+        raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
+    return lowering.inline(_program(function, len(avals), avals[0].shape), inputs)
+
+
 @cache
-def _program(shape: tuple[int, ...]) -> ClosedJaxpr:
-    over = gamma_masses
+def _program(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+    over = function
     for _ in shape:
         over = jax.vmap(over)
     with jax.enable_x64(True):
-        return jax.make_jaxpr(over)(like(shape, np.float64), like(shape, np.float64))
+        return jax.make_jaxpr(over)(*[like(shape, np.float64)] * count)
 
 
+OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "bessel_i0e": partial(scaled_bessel, 0),
+    "bessel_i1e": partial(scaled_bessel, 1),
+    "digamma": digamma,
+}
 IN_MEMORY |= {"igamma": _masses, "igammac": _masses}
+IN_MEMORY |= {name: partial(_inlined, function) for name, function in OF_ONE.items()}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.parts import CERTAIN, Parts
-from heliograph.filters.event.truncated_normal import truncated_normal
+from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.numerics.lapack import eigh
 
 MOST_COMPONENTS = 3  # nodes are a grid over all but one of them
@@ -78,20 +78,28 @@ def cut_to_ball(parts: Parts, directions: jax.Array, radius: jax.Array, inside: 
         possible = jnp.isfinite(moments.log_mass)
         shift = jnp.where(possible, moments.mean - centre, 0.0)
         less = jnp.where(possible, jnp.diag(size) - moments.covariance, 0.0)
-        return moments.log_mass, mean + gain @ shift, covariance - gain @ less @ gain.T
+        return moments.log_mass, mean + gain @ shift, (covariance - gain @ less @ gain.T)[rows, columns]
 
-    log_mass, mean, covariance = jax.lax.map(lambda moments: single(*moments), (parts.mean, parts.covariance))
-    return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
+    # Of a covariance, what lies on and below its diagonal, which is all that it is.
+    size = parts.mean.shape[1]
+    rows, columns = np.tril_indices(size)
+    log_mass, mean, lower = jax.lax.map(lambda moments: single(*moments), (parts.mean, parts.covariance))
+    places = np.zeros((size, size), dtype=int)
+    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
+    return Parts(parts.log_weight + log_mass, mean, lower[:, places], parts.label)
 
 
 def _slice(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
     """One component within the radius, (1, ...), or below and above it, (2, ...)."""
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
-    low, high = (edge[:1], edge[1:]) if inside else (jnp.append(-jnp.inf, edge[1]), jnp.append(edge[0], jnp.inf))
-    moments = truncated_normal((low - centre) / deviation, (high - centre) / deviation)
+    if inside:
+        side, moments = jnp.ones(1), truncated_normal((edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation)
+    else:
+        side = jnp.array([-1.0, 1.0])
+        moments = upper_tail((radius - side * centre) / deviation)
     possible = jnp.isfinite(moments.log_mass)
-    mean = jnp.where(possible, centre + deviation * moments.mean, centre)
+    mean = jnp.where(possible, centre + deviation * side * moments.mean, centre)
     spread = jnp.where(possible, variance * moments.variance, variance)
     return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
 

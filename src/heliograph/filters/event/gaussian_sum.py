@@ -189,25 +189,26 @@ class EventFilter(AbstractSizedFilter):
         as_it_was, label = np.r_[0 : n + m], wide.label[:, s]
         waiting, due = self._by_age(label, begun)
         loss = self._loss(channel, s)[:, None, None]
-        unsent = wide.labelled(s, waiting)
-        dropped, forced = (wide.labelled(s, _sent(which * loss, True)) for which in (waiting, due))
+        dropped, forced = (_sent(which * loss, True) for which in (waiting, due))
         if self.trigger.losses == "known":
-            unsent = unsent.times(jnp.where(lost > 0, -jnp.inf, 0.0))
-            dropped, forced = (hypothesis.times(jnp.where(lost > 0, 0.0, -jnp.inf)) for hypothesis in (dropped, forced))
+            waiting = jnp.where(lost > 0, 0.0, waiting)
+            dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
 
         # Known reference: every Gaussian cut to each part of the line, and joined part by part.
         if not self.follows:
-            slots, _ = self._inside(together([unsent, forced]) if self.loses else unsent, unsent.some(0, 0), sender)
+            inside = wide.labelled(s, waiting + forced if self.loses else waiting)
+            slots, _ = self._inside(inside, inside.some(0, 0), sender)
             if self.loses:
-                outside = self._outside_of(together([dropped, forced]), sender, 1.0)
+                outside = self._outside_of(wide.labelled(s, dropped + forced), sender, 1.0)
                 slots = together([slots, join(outside, self._outside)])
             return self._or_nothing(slots.keep(as_it_was), wide)
 
         # Reference that may be a value that was lost: not sent, with the reference as it was ...
+        unsent = wide.labelled(s, waiting)
         slots, others = self._inside(unsent.some(0, self.known), unsent.some(self.known), sender)
         # ... or sent and lost, with y as the new reference: above, below, or anywhere where it was due.
-        outside = join(self._outside_of(dropped, sender, 1.0), self._outside)
-        fresh = together([outside, join(forced)]).keep(self._renewed(sender))
+        outside = join(self._outside_of(wide.labelled(s, dropped), sender, 1.0), self._outside)
+        fresh = together([outside, join(wide.labelled(s, forced))]).keep(self._renewed(sender))
         few = reduced(together([others.keep(as_it_was), fresh]), self.lost, slice(n + sender.start, n + sender.stop))
         return self._or_nothing(together([slots.keep(as_it_was), few]), wide)
 

@@ -107,7 +107,8 @@ def _cut(parts: Parts, law: tuple[jax.Array, jax.Array, jax.Array], ends: Sequen
     less = jnp.where(possible, 1 - moments.variance, 0.0)
     mean = parts.mean + gain * shift[:, None]
     covariance = jax.vmap(lambda p: with_rounding(p, 1))(parts.covariance)
-    covariance = covariance - less[:, None, None] * gain[:, :, None] * gain[:, None]
+    # The product of gains first, so that it is one number for (i, j) and (j, i).
+    covariance = covariance - less[:, None, None] * (gain[:, :, None] * gain[:, None])
     return Parts(parts.log_weight + log_mass, mean, covariance, parts.label)
 
 

@@ -63,14 +63,15 @@ class Fused(Module):
         uplinks: dict[str, PyTree] = {}
         # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
-            send = eqx.filter_vmap(lambda q, s, mean: at(q, k).step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
-            states, sent = eqx.filter_vmap(send, in_axes=(eqx.if_array(0), 0, 0))(self.quantizers, states, means)
+            fusions, nodes = self.order.shape
+            send = over_all(over_all(lambda q, s, mean: at(q, k).step(s, mean), nodes), fusions)
+            states, sent = send(self.quantizers, states, means)
             means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
         # Angles near those of the first node, then the rules in parallel.
         means = nearest(means, means[:, :1], self.angles)
-        combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
+        combine = over_all(lambda rule, *parts: rule.combine(*parts), len(self.names))
         mean, covariance = combine(self.rules, means, covariances)
         mean = wrapped(mean, self.angles)
         items = enumerate(zip(self.names, self.claims, strict=True))
