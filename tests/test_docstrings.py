@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -36,11 +37,17 @@ ROOTS = (Path(heliograph_studies.__file__).parent, Path(__file__).parent)
 OTHERS = sorted(path for root in ROOTS for path in root.rglob("*.py"))
 
 
-def definitions(path: Path) -> Iterator[Function | ast.ClassDef]:
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file, read once for all tests."""
+    return ast.parse(path.read_text())
+
+
+@cache
+def definitions(path: Path) -> list[Function | ast.ClassDef]:
     """Every function and class of a file."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            yield node
+    nodes = ast.walk(parsed(path))
+    return [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)]
 
 
 def names_of(room: Path) -> set[str]:
@@ -53,7 +60,7 @@ def public() -> Iterator[tuple[Path, Function | ast.ClassDef]]:
     """Public functions and classes, by the file that defines them."""
     for path in PATHS:
         names = names_of(SOURCE / path.relative_to(SOURCE).parts[0]) if path.parent != SOURCE else set()
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name not in names:
                 continue
             if not any(ast.unparse(decorator) == "overload" for decorator in node.decorator_list):
@@ -79,14 +86,14 @@ def parameters(node: Function | ast.ClassDef) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
+def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word():
     wrong = []
-    for node in [ast.parse(path.read_text()), *definitions(path)]:
+    for path, node in ((file, node) for file in PATHS for node in (parsed(file), *definitions(file))):
         text = ast.get_docstring(node) or ""
         first = re.match(r"[\W_]*([\w']+)", text)
         if (first and first[1].lower() in FIRST) or PRIVATE.search(text):
-            wrong.append(f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}")
+            where = f"{path.relative_to(SOURCE)}: {getattr(node, 'name', 'module')}"
+            wrong.append(f"{where}: {text.splitlines()[0]}")
     assert not wrong, "\n".join(wrong)
 
 
@@ -96,7 +103,7 @@ def test_docstrings_of_studies_and_tests_have_no_private_word():
     wrong = {
         f"{path}: {getattr(node, 'name', 'module')}: {used[0]}"
         for path in OTHERS
-        for node in [ast.parse(path.read_text()), *definitions(path)]
+        for node in [parsed(path), *definitions(path)]
         if (used := [word for word in PRIVATE.findall(ast.get_docstring(node) or "") if word.lower() != "beside"])
     }
     assert not wrong, "\n".join(sorted(wrong))
@@ -119,12 +126,15 @@ def longest_step(node: Function, lines: list[str]) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_a_long_function_has_a_comment_above_its_steps(path):
+def test_a_long_function_has_a_comment_above_its_steps():
     """A step is at most STEP statements, so that no comment stands for half a page."""
-    lines = path.read_text().splitlines()
-    functions = [node for node in definitions(path) if not isinstance(node, ast.ClassDef)]
-    assert not [f"{node.name}: {count}" for node in functions if (count := longest_step(node, lines)) > STEP]
+    wrong = []
+    for path in PATHS:
+        lines = path.read_text().splitlines()
+        functions = [node for node in definitions(path) if not isinstance(node, ast.ClassDef)]
+        long = [f"{node.name}: {count}" for node in functions if (count := longest_step(node, lines)) > STEP]
+        wrong += [f"{path.relative_to(SOURCE)}: {name}" for name in long]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_every_parameter_of_what_is_public_is_in_its_docstring():

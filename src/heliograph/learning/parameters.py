@@ -43,7 +43,7 @@ class Parameter:
     def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
         """Entries at a point of the line."""
         with jax.enable_x64(True):
-            return np.asarray(self._read_at(jnp.asarray(x)))
+            return np.asarray(self._read_at(np.asarray(x)))
 
     def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
         """Derivatives of the entries at a point of the line."""
@@ -125,7 +125,7 @@ class Parameters:
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
         """Numbers at a point of the line by name, as plain numbers and arrays."""
         with jax.enable_x64(True):
-            return {name: plain_number(value) for name, value in self.values(jnp.asarray(x)).items()}
+            return {name: plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Values of the entries."""

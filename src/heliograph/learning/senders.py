@@ -23,6 +23,7 @@ from heliograph.simulation.node import Node
 FURTHEST = 4.0  # on the line, in logarithms and logits: an interval that reaches so far has no end there
 HALVINGS = 12
 DIGITS = 1e-4  # of the line
+NEAR = 1e-3  # of the ends of an interval, and of what is searched for them
 
 Likelihood = Callable[[Float[np.ndarray, " p"]], float]
 
@@ -135,20 +136,28 @@ def filter_at(network: Network) -> AbstractFilter:
 
 
 def _highest(
-    likelihood: Likelihood, start: Float[np.ndarray, " p"], enough: float = np.inf
+    likelihood: Likelihood,
+    start: Float[np.ndarray, " p"],
+    enough: float = np.inf,
+    size: float = 0.2,
+    digits: float = DIGITS,
 ) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """The maximum that is reached from a start, or the first point above `enough`."""
-    if not len(start):
-        return start, likelihood(start), True
-    simplex = start + 0.2 * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
-    options: Any = {"initial_simplex": simplex, "xatol": DIGITS, "fatol": 1e-3, "maxfev": 200 * len(start)}
+    """The maximum that is reached from a start by a simplex of this size, or the first point above `enough`."""
+    first = likelihood(start)
+    if not len(start) or first > enough:
+        return start, first, True
+    simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
+    options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": 200 * len(start)}
     climb: Any = minimize  # its types do not know an initial simplex
 
     def stop(intermediate_result: Any) -> None:
         if -intermediate_result.fun > enough:
             raise StopIteration
 
-    optimum = climb(lambda x: -likelihood(x), start, method="Nelder-Mead", options=options, callback=stop)
+    def lack(x: Float[np.ndarray, " p"]) -> float:
+        return -first if np.array_equal(x, start) else -likelihood(x)
+
+    optimum = climb(lack, start, method="Nelder-Mead", options=options, callback=stop)
     return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
 
 
@@ -157,9 +166,13 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
 
+    # The profile at a value, searched from where it was highest at the last one, as far as the two are apart.
     def near(value: float) -> bool:
-        rest, least = np.delete(x, coordinate), total - TWO_SIDED
-        return _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest, least)[1] > least
+        (known, rest), least = last, total - TWO_SIDED
+        size = float(np.clip(abs(value - known), 10 * NEAR, 0.2))
+        rest, top, _ = _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest, least, size, NEAR)
+        last[:] = [value, rest]
+        return top > least
 
     def number(value: float) -> float:
         point = x.copy()
@@ -169,14 +182,14 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
     # Doubled steps until the profile is below, then bisection.
     ends = []
     for sign in (-1.0, 1.0):
-        inside, outside = 0.0, 0.05
+        inside, outside, last = 0.0, 0.05, [x[coordinate], np.delete(x, coordinate)]
         while outside < FURTHEST and near(x[coordinate] + sign * outside):
             inside, outside = outside, 2 * outside
         for _ in range(HALVINGS):
             middle = (inside + outside) / 2
             still = near(x[coordinate] + sign * middle)
             inside, outside = (middle, outside) if still else (inside, middle)
-            if outside - inside < 1e-3:
+            if outside - inside < NEAR:
                 break
         ends.append(number(x[coordinate] + sign * outside))
     low, high = sorted(ends)

@@ -49,12 +49,13 @@ def test_one_core_gives_the_same_bits(monkeypatch):
 
 DEVICES = """
 import numpy as np, jax, sys
+from tests.simulation.both import Both
 from tests.simulation.runs.test_lanes import network, HORIZON, RUNS
 import heliograph as hg
 assert len(jax.devices()) == 3
-record = hg.monte_carlo(network(), HORIZON, RUNS, 0)
-statistics = hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics(), chunk=64)["a"]["f"]
-np.savez(sys.argv[1], truth=record.truth, mean=record.estimates["a"]["f"].mean, outer=statistics.outer)
+record, statistics = hg.monte_carlo(network(), HORIZON, RUNS, 0, Both(), chunk=64)
+outer = statistics["a"]["f"].outer
+np.savez(sys.argv[1], truth=record.truth, mean=record.estimates["a"]["f"].mean, outer=outer)
 """
 
 
@@ -111,7 +112,7 @@ def test_what_single_precision_takes_for_none_is_said():
         hg.monte_carlo(small, 1, 4, 0, precision="float32")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        hg.monte_carlo(network(), 1, 4, 0, precision="float32")
+        hg.monte_carlo(network(), HORIZON, LANES * BLOCK, 0, hg.Statistics(), precision="float32")
 
 
 def test_an_unknown_precision_is_refused():

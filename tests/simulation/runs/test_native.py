@@ -18,6 +18,7 @@ from heliograph.simulation.runs.native import native
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from tests.relays.relay_problems import example
+from tests.simulation.both import Both
 from tests.simulation.test_relay_worlds import relays
 from tests.simulation.test_shared_fading import PLANT as ALONE
 from tests.simulation.test_shared_fading import SENSOR as GAIN
@@ -82,25 +83,6 @@ NETWORKS = {
     "relays": lambda: relays(example(), local_error_design(example(), 20)),
     "quantized": lambda: NETWORK,
 }
-
-
-class Both(AbstractReducer):
-    """Trajectories and statistics of the same runs, so that XLA compiles one program for the two."""
-
-    def of_step(self, step):
-        record, sums = Trajectories().of_step(step), hg.Statistics().of_step(step)
-        return OfStep(sums=sums.sums, ever=sums.ever, collected=(record.collected, sums.collected))
-
-    def summed(self, sums, common, count):
-        return hg.Statistics().summed(sums, common, count)
-
-    def finish(self, carry, collected, network):
-        record, sums = collected
-        return Trajectories().finish((), record, network), hg.Statistics().finish(carry, sums, network)
-
-    def others(self, filtered, smoothed, claims):
-        reducers = Trajectories(), hg.Statistics()
-        return tuple(reducer.others(*both, claims) for reducer, *both in zip(reducers, filtered, smoothed, strict=True))
 
 
 def by(engine: str, *args: object, **kwargs: object) -> object:

@@ -35,10 +35,9 @@ class Slots:
     def load(self, writer: "Writer", node: Node) -> str:
         """Load a shared number, a scalar."""
         address = self._address(writer, node)
-        loaded = writer.add(f"load i{BITS[node.type]}, ptr {address}, align 8")
         if node.type == "bool":
-            return writer.add(f"trunc i8 {loaded} to i1")
-        return writer.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
+            return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
+        return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
 
     def store(self, writer: "Writer", node: Node, name: str) -> None:
         """Store a number, which the other function uses."""
@@ -166,6 +165,8 @@ class Writer:
     def _everywhere(self, name: str, type: Type) -> str:
         kind = vector(type, self.width)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
+        if self.width == 1:
+            return first
         return self.add(f"shufflevector {kind} {first}, {kind} poison, <{self.width} x i32> zeroinitializer")
 
     def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
@@ -222,10 +223,9 @@ class Writer:
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
         address = self._address(buffer, offset, strides, node.args, 1)
-        loaded = self.add(f"load i{BITS[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
         if node.type == "bool":
-            return self.add(f"icmp ne i8 {loaded}, 0")
-        return self.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
+            return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
+        return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _gather(self, node: Node) -> str:
         """Load a number at a different place in each lane."""

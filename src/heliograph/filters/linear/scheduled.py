@@ -50,10 +50,12 @@ class ScheduledFilter(AbstractSizedFilter):
         schedule: gains and covariances for each step.
         states: names of the states; x0, x1, ... by default.
 
-    Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
+    Shapes: covariances (2 horizon + 1, q, q), before and after each correction; unused (horizon, m), components of no
+    gain.
     """
 
     gains: OverTime
+    unused: np.ndarray
     covariances: np.ndarray
     start: np.ndarray
 
@@ -61,6 +63,7 @@ class ScheduledFilter(AbstractSizedFilter):
         instance("schedule", schedule, Schedule, "a Schedule")
         g = schedule.gains
         self.gains = OverTime(_if_expected(g))
+        self.unused = np.all(g.gain == 0, axis=1) & np.all(g.direct == 0, axis=1)
         known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
         self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
         self.start, self.claim = schedule.start, schedule.claim
@@ -93,12 +96,11 @@ class ScheduledFilter(AbstractSizedFilter):
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
         observed = jnp.where(present, z - state.expected, 0.0)
-        unused = jnp.all(g.gain == 0, axis=0) & jnp.all(g.direct == 0, axis=0)
         after = ScheduleState(
             state.value + g.gain @ observed,
             state.mean + g.direct @ observed,
             state.expected,
-            state.complete & jnp.all(present | unused),
+            state.complete & jnp.all(present | jnp.asarray(self.unused)[k]),
             jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
         )
         return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
 from heliograph.numerics.check import Domain, fail
+from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, PyTree
 
 
@@ -33,7 +35,8 @@ def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float
 
 
 def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
-    """Number at a point of the line, in operations that JAX traces."""
+    """Number at a point of the line, in operations that JAX traces; of an interval's plain number a plain one."""
+    # Simplexes and covariances.
     if domain.kind == "simplex":
         rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
         weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
@@ -43,12 +46,16 @@ def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
         factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
         factor = jnp.where(np.eye(shape[0], dtype=bool), jnp.exp(jnp.diag(jnp.diag(factor))), factor)
         return factor @ factor.T
-    value = jnp.reshape(x, shape)
+    # Intervals.
+    xp = library(x)
+    value: Array = xp.reshape(x, shape)
     if np.isfinite(domain.low) and np.isfinite(domain.high):
-        return domain.low + (domain.high - domain.low) * jax.nn.sigmoid(value)
+        return domain.low + (domain.high - domain.low) * (expit if xp is np else jax.nn.sigmoid)(value)
+    with np.errstate(over="ignore"):
+        power: Array = xp.exp(value)
     if np.isfinite(domain.low):
-        return domain.low + jnp.exp(value)
-    return domain.high - jnp.exp(value) if np.isfinite(domain.high) else value
+        return domain.low + power
+    return domain.high - power if np.isfinite(domain.high) else value
 
 
 def link(domain: Domain, value: PyTree) -> PyTree:
