@@ -188,6 +188,17 @@ def test_arithmetic_on_whole_recordings_is_a_loop_over_their_rows():
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
 
 
+def test_integers_are_sorted_with_what_comes_with_them():
+    def function(k, x):
+        return jnp.sort(k), *jax.lax.sort((k, x), dimension=0, num_keys=1), jnp.argsort(k, axis=1)
+
+    k, x = RANDOM.integers(-3, 4, size=(11, 7, 4)), RANDOM.normal(size=(11, 7, 4))
+    with jax.enable_x64(True):
+        expected = jax.vmap(function)(k, x)
+    for a, b in zip(compile(function, k[0], x[0])(k, x), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_numbers_of_the_data_choose_rows_of_tables_and_recordings():
     table = RANDOM.normal(size=(80, 2))
 
