@@ -11,7 +11,6 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows import data_of
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.backward_pass import planned_with_past, quiet_steps, stepped
@@ -82,12 +81,9 @@ class PlannedSmoother(Module):
     inputs: Float[Array, "horizon inputs"]
     estimate: Estimate
 
-    @in_float64
     def means(self, z: ArrayLike) -> Float[jax.Array, "time n"]:
         """Smoothed means of one run's z (horizon, received), also for `hg.simulation.over_runs` and `jax.vmap`."""
-        z = array("measurements", z, (len(self.inputs), self.filter.received), missing=True)
-        _, steps = stepped(self.filter, jnp.asarray(z), self.inputs, self.filter.init(), np.asarray(0))
-        return self.smoothing.means(jax.tree.map(jnp.asarray, steps))
+        return _means(self, array("measurements", z, (len(self.inputs), self.filter.received), missing=True))
 
 
 def planned_smoother(
@@ -115,6 +111,12 @@ def planned_smoother(
     if planned is None:
         raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
     return PlannedSmoother(planned, smoothing, u, _estimate(filter, smoothing, u))
+
+
+@compiled
+def _means(planned: PlannedSmoother, z: Array) -> jax.Array:
+    _, steps = stepped(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
+    return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
 @compiled

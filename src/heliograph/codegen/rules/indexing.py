@@ -7,9 +7,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
-from heliograph.codegen.lowering import RULES, Lowering, Rule, known_integers
+from heliograph.codegen.lowering import RULES, Lowering, Rule, known_integers, type_of
 from heliograph.codegen.memory import contiguous
 from heliograph.codegen.nodes import Unsupported
+from heliograph.codegen.rules.elementwise import select
 from heliograph.codegen.rules.loops import in_memory
 from heliograph.codegen.rules.shapes import FEW, chosen
 from heliograph.codegen.rules.views import clamped
@@ -163,7 +164,28 @@ def _scatter(op: str | None) -> Rule:
     return rule
 
 
+SORTED = 20  # integers: those of larger permutations are many comparisons
+
+
+def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Sort the integers of a permutation, and what comes with them, by odd-even transposition: without branches."""
+    axis, graph = equation.params["dimension"], lowering.graph
+    count, kind = inputs[0].shape[axis], type_of(equation.invars[0].aval)
+    if equation.params["num_keys"] != 1 or kind[0] not in "iu" or count > SORTED:
+        raise Unsupported("sort")
+    moved = [np.moveaxis(x, axis, -1).copy() for x in inputs]
+    for index in np.ndindex(*moved[0].shape[:-1]):
+        rows = [x[index] for x in moved]
+        for turn in range(count):
+            for i in range(turn % 2, count - 1, 2):
+                wrong = graph.node("gt", "bool", rows[0][i], rows[0][i + 1])
+                for row in rows:
+                    a, b = row[i], row[i + 1]
+                    row[i], row[i + 1] = select(graph, wrong, b, a), select(graph, wrong, a, b)
+    return [np.moveaxis(x, -1, axis) for x in moved]
+
+
 RULES |= {
     "gather": _gather, "scatter": _scatter(None), "scatter-add": _scatter("add"), "scatter_add": _scatter("add"),
-    "scatter-mul": _scatter("mul"), "scatter_mul": _scatter("mul"),
+    "scatter-mul": _scatter("mul"), "scatter_mul": _scatter("mul"), "sort": _sort,
 }  # fmt: skip
