@@ -6,9 +6,11 @@ import jax
 import numpy as np
 import scipy
 
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import exponents, monomials
+from heliograph.simulation.runs.over_runs import over_runs
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
 
@@ -84,7 +86,8 @@ def _compare_modes(
 def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return first and second draws of H, after testing the contract of `init`, `draw` and `sample`."""
 
-    def two_steps(key: jax.Array) -> object:
+    def two_steps(words: jax.Array) -> PyTree:
+        key = jax.random.wrap_key_data(words)
         start = channel.init(jax.random.fold_in(key, 2))
         state, h = channel.draw(start, key)
         sampled = () if channel.remembers else channel.sample(key)
@@ -92,8 +95,8 @@ def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.n
 
     # Contract: a state of constant structure, and `draw` equal to `sample` without memory.
     with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(seed), samples)
-        start, state, h, following, later, sampled = jax.jit(jax.vmap(two_steps))(keys)
+        words = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(seed), samples)))
+        start, state, h, following, later, sampled = over_runs(two_steps, words)
         assert channel.remembers or start == (), f"init: expected () of a map that forgets, got {start}"
         shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), s) for s in (start, state, following)]
         assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
