@@ -67,11 +67,12 @@ def test_every_filter_gives_what_xla_gives(name):
     """Of LLVM's code and of JAX's operation by operation, to 1e-12 of the claimed deviation; missing data among it."""
     item = FILTERS[name]()
     single, z = over_recording(item), measurements(item, 5, 30)
+    program = lower(single, z[0])
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
-        by_jax = jax.jit(jax.vmap(function_of(lower(single, z[0]))))(z)
+        by_jax = jax.jit(jax.vmap(function_of(program)))(z)
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
-    for mean, covariance in (compile(single, z[0])(z), map(np.asarray, by_jax)):
+    for mean, covariance in (Compiled(program, [True])(z), map(np.asarray, by_jax)):
         assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
         assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
 
@@ -84,7 +85,7 @@ def test_filters_of_more_states_than_xla_writes_out(name):
     assert engine_of(single, z).startswith("native")
     with jax.enable_x64(True):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
-    mean, covariance = compile(single, z[0])(z)
+    mean, covariance = hg.simulation.over_runs(single, z)
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
     assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
     assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
@@ -250,7 +251,7 @@ def test_derivatives_of_the_graph_are_those_of_the_function():
     single, z = over_recording(item), RANDOM.normal(size=(15, item.received))
     with jax.enable_x64(True):
         by_graph, by_jax = (
-            jax.grad(lambda z, f=f: jnp.sum(f(z)[0] ** 2))(z) for f in (function_of(lower(single, z)), single)
+            jax.jit(jax.grad(lambda z, f=f: jnp.sum(f(z)[0] ** 2)))(z) for f in (function_of(lower(single, z)), single)
         )
     np.testing.assert_allclose(by_graph, by_jax, rtol=1e-11, atol=1e-12)
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.special import i0e
+from jax.scipy.special import betainc
 
 import heliograph as hg
 from heliograph.live.stepper import NativeStepper, XlaStepper
@@ -151,8 +151,14 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
 
 
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
-    """One of a plant with a Bessel function; by native code alone it is refused in one line."""
-    plant = hg.Plant(lambda x, u: 0.5 * x + i0e(x) * u, 0.1 * np.eye(2), [1.0, -1.0], np.eye(2), inputs=["push"])
+    """One of a plant with an incomplete beta function; by native code alone it is refused in one line."""
+    plant = hg.Plant(
+        lambda x, u: 0.5 * x + betainc(2.0, 3.0, x**2 / (1 + x**2)) * u,
+        0.1 * np.eye(2),
+        [1.0, -1.0],
+        np.eye(2),
+        inputs=["push"],
+    )
     item = hg.cubature_filter(plant, SENSOR, hg.hop(1.0, 0.1, dimension=2))
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
     with pytest.raises(ValueError, match="native code: expected a program of operations that it takes") as caught:
