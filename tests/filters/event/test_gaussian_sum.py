@@ -103,9 +103,10 @@ def test_a_wide_delta_sends_the_first_value_alone():
 
 
 @pytest.mark.slow
-def test_certain_loss_leaves_the_prior():
+@pytest.mark.parametrize("reference", ["sent", "acknowledged"])
+def test_certain_loss_leaves_the_prior(reference):
     """Every value is lost, so that silence says nothing: to the joining of the sum, 1 % of a variance."""
-    channel, trigger = hg.erasure(hg.perfect(), 0.0), hg.SendOnDelta(0.6)
+    channel, trigger = hg.erasure(hg.perfect(), 0.0), hg.SendOnDelta(0.6, reference=reference)
     z, sent = simulated(channel, trigger, 30)
     assert np.all(np.isnan(z)) and np.all(sent <= 0) and np.any(sent < 0)
     result = follow(hg.event_filter(PLANT, SENSOR, channel, trigger), z)
