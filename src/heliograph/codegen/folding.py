@@ -221,6 +221,17 @@ def _compare(op: str) -> Callable[..., Node | None]:
     return rule
 
 
+def _order(strict: bool, turned: bool) -> Callable[..., Node | None]:
+    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+        """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
+        if a.type != "bool":
+            return None
+        low, high = (b, a) if turned else (a, b)
+        return graph.node("and" if strict else "or", "bool", graph.node("not", "bool", low), high)
+
+    return rule
+
+
 def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
     if a.type == type:
         return a
@@ -232,5 +243,6 @@ def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
 SIMPLER: dict[str, Callable[..., Node | None]] = {
     "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "and": _and, "or": _or, "xor": _xor, "not": _not,
     "shift_left": _shift, "shift_right": _shift, "max": _same, "min": _same, "select": _select, "eq": _compare("eq"),
-    "ne": _compare("ne"), "convert": _convert,
+    "ne": _compare("ne"), "convert": _convert, "lt": _order(True, False), "le": _order(False, False),
+    "gt": _order(True, True), "ge": _order(False, True),
 }  # fmt: skip
