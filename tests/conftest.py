@@ -21,9 +21,6 @@ IN_A_HURRY = (
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_disable_hlo_passes=hlo-verifier",
 )
-# Of native code: instructions chosen one by one, in order, a quarter of LLVM's time. What is computed, to the bit, the
-# text alone decides. A release that does not know one of them ignores it.
-ONE_BY_ONE = ("-combiner-disabled", "-pre-RA-sched=fast")
 
 jaxtyping.jaxtyped = where_shaped  # what the import hook decorates the checked packages with
 
@@ -90,10 +87,6 @@ def pytest_collection_finish():
 
         sys.modules["jax"].config.update("jax_enable_compilation_cache", False)
         reset_cache()  # whether there is one is asked once, and what is collected may have asked
-        import llvmlite.binding
-
-        for flag in ONE_BY_ONE:
-            llvmlite.binding.set_option("tests", flag)
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
