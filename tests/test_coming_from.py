@@ -26,7 +26,6 @@ def theirs():
     return item
 
 
-@pytest.mark.slow
 def test_the_kalman_filter_and_its_smoother_are_those_of_filterpy():
     kalman = hg.kalman_filter(*hg.state_space(F, H, Q, R, MEAN, COVARIANCE))
     means, covariances, _, _ = theirs().batch_filter(Z)

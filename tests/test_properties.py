@@ -89,7 +89,6 @@ def apart(first, second):
     return np.maximum(*gaps)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("n", "m"), SIZES)
 @pytest.mark.parametrize("build", [hg.cubature_filter, hg.extended_filter, hg.linear_filter])
 def test_bounds_stay_positive_semidefinite(build, n, m):
@@ -121,7 +120,6 @@ def test_missing_data_equal_a_channel_that_is_off(n, m):
     hold(cases, apart(follow_each(whole, missing), follow_each(off, rows(cases))), ROUNDING)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("n", "m"), SIZES)
 def test_recordings_step_by_step(n, m):
     """Of ten networks with one list of chains, whose numbers differ: a network's channel is part of its program."""

@@ -76,7 +76,6 @@ def imports(path: Path) -> set[str]:
 FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
 def test_imports_flow_with_the_data(path):
     local = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")

@@ -73,7 +73,6 @@ def test_an_output_that_takes_nothing_is_named(capsys, monkeypatch):
     assert capsys.readouterr().err == "heliograph: standard output: No space left on device\n"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--version"], ["run", "--help"]])
 @pytest.mark.parametrize("buffered", [True, False])
 def test_a_process_whose_output_takes_nothing_says_so_once(arguments, buffered):
@@ -121,7 +120,6 @@ def test_help_does_not_load_jax():
     assert "run" in said and "demo" in said and "example" in said
 
 
-@pytest.mark.slow
 def test_lists_do_not_load_jax():
     lines = without_jax(["example"]).splitlines()
     assert [line.split()[0] for line in lines] == [
@@ -148,7 +146,6 @@ def test_lists_do_not_load_jax():
     assert all(len(line.split()) > 5 for line in lines + methods)
 
 
-@pytest.mark.slow
 def test_a_refusal_in_a_process_of_its_own(folder):
     (folder / "data.csv").write_text("time,push,poss\n0,0,1\n")
     before = contents(folder)

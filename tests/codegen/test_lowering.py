@@ -36,7 +36,6 @@ X = np.random.default_rng(3).normal(size=(3, 4))
 S = X @ X.T + np.eye(3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

@@ -32,7 +32,6 @@ def drawn(random, size, usual):
 
 
 @needs_compiler
-@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_no_number_spoils_a_device(name, precision, tmp_path):
@@ -52,7 +51,6 @@ def test_no_number_spoils_a_device(name, precision, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_after_absurd_measurements_a_device_follows_the_plant(name, precision, tmp_path):

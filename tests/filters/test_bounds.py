@@ -95,7 +95,6 @@ ONE_STEP = {  # trace of the bound after one step from tr P- = .08353, from the 
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ONE_STEP)
 def test_one_step_traces(name):
     update, trace = ONE_STEP[name]

@@ -40,7 +40,6 @@ FILTERS = {
 ABSURD = [1e16, -1e20, 1e155, -1e308]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_no_absurd_value_leaves_a_trace(name):
     """Measurements, with and without missing components, and inputs; the state after it, bit for bit."""

@@ -19,7 +19,6 @@ RULES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_contract(name):
     check_fusion(RULES[name])
@@ -74,7 +73,6 @@ def test_a_dominating_sensor_is_returned():
     np.testing.assert_allclose(fused.covariance, good, rtol=1e-8)  # weight 1 is approached from inside: gap 1e-10
 
 
-@pytest.mark.slow
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=20)
 def test_optimal_is_best_and_no_worse_than_any_input(seed):

@@ -14,7 +14,6 @@ from tests.oracles import h_infinity_fusion as paper
 START = 10 * np.eye(4)  # the paper's P_0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["trace", "largest_eigenvalue", "log_determinant"])
 @pytest.mark.parametrize("i", range(4))
 def test_the_published_levels_can_be_designed_at_every_step(i, objective):
@@ -58,7 +57,6 @@ def over_the_horizon(i):
     return hg.h_infinity.horizon_design(node(i))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("i", range(4))
 def test_smallest_levels_over_the_horizon(i):
     """Two solvers and an independent derivation agree to the digits given; separate multipliers have a closed form."""
@@ -94,7 +92,6 @@ def test_steps_that_are_the_same_are_compiled_once(monkeypatch):
     assert len(made) == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("i", range(4))
 def test_a_largest_eigenvalue_leaves_no_tie_open(i):
     """Many P+ share the smallest largest eigenvalue of L, and only the larger of them let later steps go on.

@@ -46,7 +46,6 @@ SMOOTH = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_a_true_constant_is_proved_and_no_sample_exceeds_the_bound(name):
     function, constant = SMOOTH[name]
@@ -155,7 +154,6 @@ def test_a_certificate_says_what_it_rests_on_and_refuses_what_does_not_fit():
     assert step.proved and certificate(step).assumed == ("|f(x)| <= a |x| with a = 0.7",)
 
 
-@pytest.mark.slow
 def test_a_finding_is_about_one_function():
     system, design = growing(0.5, 0.2)
     parts = design.gains, design.weights, design.multipliers, design.level

@@ -179,7 +179,6 @@ def test_recordings_that_cannot_be_learned_from(build, data, message):
         hg.fit(build, data, INPUTS)
 
 
-@pytest.mark.slow
 def test_a_value_of_a_noise_with_two_values_is_learned():
     """Its powers, 0 to 2, are moments of a noise that depends on what is searched for."""
 

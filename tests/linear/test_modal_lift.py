@@ -45,7 +45,6 @@ def test_a_chain_that_varies_moves_at_its_steps():
     np.testing.assert_allclose(errors(moving, 2, 6), errors(known, 2, 6), rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_its_claim_holds_in_simulation():
     item = hg.polynomial_filter(PLANT, SENSOR, bursts(), 20, 3)
     record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, bursts(), {"cubic": item})}), 20, 2000, 6)

@@ -186,7 +186,6 @@ def test_a_stream_that_was_saved_goes_on_with_the_same_bits():
         assert np.array_equal(a.mean, b.mean) and np.array_equal(a.covariance, b.covariance)
 
 
-@pytest.mark.slow
 def test_the_snapshot_of_another_filter_is_refused_with_what_differs():
     data = hg.Stream(hg.linear_filter(PLANT, SENSOR, hg.perfect(2))).save()
     same = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))

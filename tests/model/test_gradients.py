@@ -122,7 +122,6 @@ LAWS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name):
     make, parameters = LAWS[name]

@@ -42,7 +42,6 @@ def test_the_same_by_simulation_with_losses_that_are_acknowledged():
     assert known.error[0] == pytest.approx(p + squares / (steps - 100), rel=0.01)
 
 
-@pytest.mark.slow
 def test_the_least_error_at_a_rate_and_what_send_on_delta_has_above_it():
     assert np.sqrt(least_error(PLANT, SENSOR, 0.1)) == pytest.approx(0.2438, abs=5e-5)
     assert np.sqrt(least_error(PLANT, SENSOR, 0.1, 0.2)) == pytest.approx(0.2800, abs=5e-5)

@@ -58,7 +58,6 @@ def chain_of(kind):
     }[kind]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dropout", "modes", "drift", "delay", "erasure"])
 def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
     hops = chain_of(kind)

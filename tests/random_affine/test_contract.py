@@ -42,19 +42,16 @@ CHANNELS = {
 LARGE = {"three hops", "dropout", "direct link", "parallel", "dropout of a direct link in series"}  # cost most
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])
 def test_samples_match_moments_to_order_four(name):
     check_random_affine(CHANNELS[name])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 3])
 def test_lifted_maps_match_to_order_two(degree):
     check_random_affine(hg.random_affine.Lift(SCALAR, degree), highest=2)
 
 
-@pytest.mark.slow
 def test_square_of_a_channel_with_two_outputs():
     check_random_affine(hg.random_affine.square(CHANNELS["direct link"]), highest=2)
 

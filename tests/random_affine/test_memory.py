@@ -92,7 +92,6 @@ COMBINED = {  # channel, entry of H, E[entry_k entry_(k+1)]
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", COMBINED)
 def test_the_state_survives(name):
     """Over two steps the product of gains has its exact mean, which draws without a state would miss."""
@@ -113,7 +112,6 @@ def test_the_state_survives(name):
         assert abs(received.mean() - MEAN**2) > 20 * error  # what independent draws would give
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["itself", "lift", "all of them"])
 def test_the_contract_holds(name):
     check_random_affine(COMBINED[name][0])

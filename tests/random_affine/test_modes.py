@@ -41,7 +41,6 @@ CHANNELS = {
 LARGE = {"chains of their own", "one chain", "a drift and a chain", "one drift twice", "loss that is not observed"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])
 def test_draws_have_the_moments_and_the_memory_that_they_state(name):
     check_random_affine(CHANNELS[name])

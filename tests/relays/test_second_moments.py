@@ -35,7 +35,6 @@ def compare(p, design, solution):
     return max(relative(a, b) for a, b in pairs)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_lemmas_and_gains_agree_with_the_oracle(name):
     p = PROBLEMS[name]()

@@ -37,7 +37,6 @@ def health():
     return examine(NETWORK, hg.run(NETWORK, received), np.zeros((STEPS, 0)))
 
 
-@pytest.mark.slow
 def test_claims_are_judged_by_innovations(health):
     good, sure = (next(filter_ for filter_ in health.filters if filter_.filter == name) for name in ("good", "sure"))
     assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.significant
@@ -76,7 +75,6 @@ def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
     assert summary["filters"]["a"]["good"]["size"] == next(f for f in health.filters if f.filter == "good").test.power
 
 
-@pytest.mark.slow
 def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
     """Neither in the table of tests nor beside its errors, nor in the summary."""
     plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
@@ -164,7 +162,6 @@ network = hg.Network(plant, nodes, {"centre": hg.kalman_filter(plant, both)})
 """
 
 
-@pytest.mark.slow
 def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "net.py").write_text(CENTRAL)
@@ -177,7 +174,6 @@ def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch
     assert "fused: estimates with bands" in page and "fused/centre" in page
 
 
-@pytest.mark.slow
 def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
     """Behind a gain that is random, the filter that takes its mean is too sure; the network relies on the exact one."""
     sensor = hg.LinearSensor([[1.0]], 0.1, outputs={"height": "m"})

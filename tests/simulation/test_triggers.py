@@ -109,7 +109,6 @@ def test_the_exact_claim_behind_chance_holds_on_average():
     assert nees.mean() == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.slow
 def test_senders_that_compare_with_a_prediction_need_a_filter_that_predicts():
     trigger = hg.SendOnPredictionError(0.5)
     item = hg.event_filter(PLANT, SENSOR, LOSSY, trigger)
@@ -120,7 +119,6 @@ def test_senders_that_compare_with_a_prediction_need_a_filter_that_predicts():
         hg.Node(SENSOR, LOSSY, {"k": hg.kalman_filter(PLANT, SENSOR)}, trigger=trigger)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("losses", ["numbered", "known"])
 @pytest.mark.parametrize("reference", ["sent", "acknowledged"])
 def test_what_is_known_of_losses_is_used_and_claimed_rightly(losses, reference):
@@ -201,7 +199,6 @@ def test_what_does_not_fit_is_refused_in_one_line():
         hg.Node(SENSOR, LOSSY, {}, trigger=hg.SendOnDelta([1.0, 2.0]))
 
 
-@pytest.mark.slow
 def test_a_recorded_value_that_the_rule_forbids_is_warned_of_and_used():
     trigger = hg.SendOnDelta(0.6, heartbeat=4)
     item = hg.event_filter(PLANT, SENSOR, hg.perfect(), trigger)

@@ -33,7 +33,6 @@ def judged(item, z, exact):
     return np.sqrt(square.mean() / variance.mean()), np.mean(square / result.covariance[:, 0, 0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "link"), [pytest.param(hg.perfect(), forgetful(0.0), marks=pytest.mark.slow), (LOSSY, forgetful(0.2))]
 )
@@ -69,7 +68,6 @@ def test_the_posterior_of_silence_has_no_more_covariance_than_silence_skipped():
     assert np.all(variance <= skipped * (1 + 1e-4))  # 1e-4: the grid
 
 
-@pytest.mark.slow
 def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     trigger = hg.SendOnDelta(5.0, heartbeat=1)
     z, _ = simulated(LOSSY, trigger, 40)
@@ -79,7 +77,6 @@ def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     np.testing.assert_allclose(result.covariance, kalman.covariance, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_delta_near_zero_is_the_kalman_filter_with_erasures():
     trigger = hg.SendOnDelta(1e-5)
     z, _ = simulated(LOSSY, trigger, 60)
@@ -102,7 +99,6 @@ def test_a_wide_delta_sends_the_first_value_alone():
     np.testing.assert_allclose(result.mean, kalman.mean, rtol=1e-11)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["sent", "acknowledged"])
 def test_certain_loss_leaves_the_prior(reference):
     """Every value is lost, so that silence says nothing: to the joining of the sum, 1 % of a variance."""
@@ -214,7 +210,6 @@ def innovations(item, state, z):
     return jax.vmap(lambda value: item.correct(state, value[None])[1])(z)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["zero", "prediction"])
 @pytest.mark.parametrize("link", [hg.perfect(), hg.hop(0.7, noise=0.05)], ids=["perfect", "hop"])
 def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, reference):

@@ -204,7 +204,6 @@ FILTERS = {
 PARALLEL = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.random_affine.Nakagami(2.0), 0.2)])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_contract(name):
     check_filter(FILTERS[name](PARALLEL))

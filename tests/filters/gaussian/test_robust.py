@@ -62,7 +62,6 @@ def test_the_score_has_the_exact_moments_of_one_component(law, z):
     assert innovation.log_likelihood == pytest.approx(np.log(whole), abs=tolerance)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "item",
     [

@@ -49,7 +49,6 @@ def taken(item, z, u):
 taken_by_xla = compiled(taken)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_its_steps_are_the_originals(name):
     original, draw = ORIGINALS[name], np.random.default_rng(3)

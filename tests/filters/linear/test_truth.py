@@ -57,7 +57,6 @@ def test_two_hops_that_drift():
     np.testing.assert_allclose(result.ratio[-1], np.diag(result.true[-1]) / np.diag(result.claimed[-1]))
 
 
-@pytest.mark.slow
 def test_a_filter_for_two_fadings_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     apart, together = (hg.parallel([link] * 2) for link in (bursts(), hg.shared(bursts(), "road")))
@@ -82,7 +81,6 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
     assert result.ratio[-1, 0] == pytest.approx(known[lag], abs=0.006)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "channel", [bursts(), hg.amplify_and_forward(HOPS), hg.model.with_direct_link(bursts(), HOPS[0])]
 )

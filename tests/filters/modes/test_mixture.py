@@ -67,7 +67,6 @@ def test_a_missing_measurement_is_a_prediction():
     assert result.mean[0] == pytest.approx(1.0) and result.covariance[0, 0] == pytest.approx(0.25 * 3 + 1.0)
 
 
-@pytest.mark.slow
 def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
     cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()

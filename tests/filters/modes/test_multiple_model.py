@@ -129,7 +129,6 @@ CURVED = hg.Plant(lambda x, u: x + 0.1 * np.array([1.0, -1.0]) * x**2, 0.01 * np
 PRODUCT = hg.Sensor(lambda x: x[:1] * x[1:], 0.1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_one_mode_is_the_cubature_filter(build):
     single = hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]])
@@ -162,7 +161,6 @@ def test_equal_maps_need_no_chain(build):
     np.testing.assert_allclose(total, known, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS)
 def test_permuting_modes_changes_nothing(build):
     data = np.random.default_rng(0).normal(size=(5, 2))
@@ -235,7 +233,6 @@ def test_losses_say_something_of_the_mode(build, data):
     np.testing.assert_allclose(result.covariance, spread, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS[1:])
 def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
@@ -254,7 +251,6 @@ def test_a_mode_that_losses_show_is_known():
         np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_what_varies_in_time_is_followed(build):
     """Equal maps, a plant and a sensor that vary: the linear filter."""

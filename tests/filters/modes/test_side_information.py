@@ -37,7 +37,6 @@ def test_flags_that_tell_nothing_change_nothing():
     np.testing.assert_allclose(result, claims(hg.linear_filter(PLANT, SENSOR, bursts()), Z), rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_flags_that_show_the_mode_make_it_the_kalman_filter_given_the_modes():
     modes = np.array([0, 0, 1, 1, 0, 1, 1, 0])
     given = hg.model.over_time([hg.hop((0.2, 1.0)[i], 0.05) for i in modes])

@@ -244,7 +244,6 @@ def test_a_record_as_events(simulated):
         hg.simulation.arrivals(record, network)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["informed", "fixed"])
 def test_the_contract(filters, name):
     check_filter(filters[name])

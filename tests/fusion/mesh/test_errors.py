@@ -196,7 +196,6 @@ def listed_mean(neighbours, names, steps, chance):
     return joint.reshape(count, n, count, n)
 
 
-@pytest.mark.slow
 def test_frozen_best_weights_claim_what_they_err():
     net = network({"m": hg.fusion.DiagonalWeights()}, link=LINK)
     frozen = hg.simulation.freeze(net, "m", arrivals(net, "m", 60, 0), last=40)
@@ -226,7 +225,6 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
             assert ours.covariance == pytest.approx(np.asarray(theirs.covariance[0]), rel=1e-10)
 
 
-@pytest.mark.slow
 def test_a_one_way_ring_is_not_starved():
     """Two nodes of opposite sides know a state each: a share by trace alone follows the one that is nearer."""
     names = [f"n{i:02}" for i in range(12)]

@@ -99,7 +99,6 @@ def test_a_run_is_that_by_hand_and_no_error_is_above_what_nothing_saturated_clai
         assert nees.mean(axis=0).max() < 1 + 5 / np.sqrt(RUNS) and nees.mean() < 1.03
 
 
-@pytest.mark.slow
 def test_where_a_quantizer_saturates_the_error_is_above_the_claim_which_is_nominal():
     """x stays what it is, a measures it, b has it from a, and c from b alone, unless |x| > 1: E[x^2 | |x| > 1] = 2.525.
 

@@ -192,7 +192,6 @@ def test_bursts_that_outlast_a_mode_are_refused(stays, refused):
         assert network({"m": RULES["trace"]}, {"b": ["a"]}, link, plant=plant, rows={"a": ([[1.0]], 0.3)}).meshes
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.4, 0.6])
 def test_fixed_shares_are_refused_where_errors_grow_as_those_before_data_do(loss, monkeypatch):
     plant, near = hg.LinearPlant([[1.2]], [[0.1]], [0.0], [[1.0]]), {"b": ["a"], "c": ["b"]}

@@ -158,7 +158,6 @@ def test_independent_losses_are_said_from_bursts():
     assert result.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["independent", "markov", "markov_4", "hidden"])
 def test_a_law_is_a_channel_with_its_losses(learned, name):
     """Long-run losses of the channel against those of the law; 4,000 drawn packets in bursts: three standard errors."""

@@ -56,7 +56,6 @@ def test_signal_columns_agree_with_the_algebra():
         np.testing.assert_allclose(result.mean[:, : result.inputs], item.moments(1).mean[:-1, :-1], atol=1e-14)
 
 
-@pytest.mark.slow
 def test_noise_power_agrees_with_the_algebra_and_with_samples():
     """E[n n'] = E[N N'] for independent sources of unit variance; 4 standard errors of 40,000 draws."""
     item = hg.dropout(

@@ -102,7 +102,6 @@ def test_bad_input_is_one_clear_line() -> None:
         noise_of_hops([hg.parallel([HOP, HOP])], 1.0)
 
 
-@pytest.mark.slow
 def test_every_transmitter_sends_its_power() -> None:
     channel = fed_back_channel(PLANT, SENSOR, [HOP, HOP], [1.0, 3.0], 12)
     fed = hg.Node(SENSOR, channel, {"fed": fed_back_filter(PLANT, SENSOR, channel)})
