@@ -125,6 +125,7 @@ def longest_step(node: Function, lines: list[str]) -> int:
     return longest
 
 
+@pytest.mark.slow
 def test_a_long_function_has_a_comment_above_its_steps():
     """A step is at most STEP statements, so that no comment stands for half a page."""
     wrong = []

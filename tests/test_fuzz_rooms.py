@@ -109,6 +109,7 @@ CALLS = [  # what is called, and arguments with which it works
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("call", "arguments"), CALLS, ids=[name_of(call) for call, _ in CALLS])
 def test_the_arguments_work(call, arguments):
     call(**ready(arguments))

@@ -25,6 +25,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_estimates_go_back_into_a_bag(folder, capsys):
     """Each row's odometry has the mean and the covariance of the table, at the time of measuring."""
     assert cli.main([*RUN, "--out", "out.csv"]) == 0 and cli.main([*RUN, "--out", "out.mcap"]) == 0
@@ -122,6 +123,7 @@ def test_a_bag_of_another_hand(folder, capsys):
     np.testing.assert_allclose(table.lateness()["gps"], 0.05, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_bag_is_learned(folder, capsys):
     """300 steps of a tenth of a second: the interval of the measurement's noise, 95 %, has the truth of 0.04 in it."""
     random = np.random.default_rng(3)

@@ -146,6 +146,7 @@ def test_lists_do_not_load_jax():
     assert all(len(line.split()) > 5 for line in lines + methods)
 
 
+@pytest.mark.slow
 def test_a_refusal_in_a_process_of_its_own(folder):
     (folder / "data.csv").write_text("time,push,poss\n0,0,1\n")
     before = contents(folder)

@@ -51,6 +51,7 @@ def summary(folder):
     return json.loads((folder / "out" / "design" / "summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_the_page_tells_the_design(folder, summary, fits):
     fits(folder / "out" / "design" / "report.html")
     result = hg.design(hg.files.load_network(str(folder / "yard.py")), budget=2.0)

@@ -111,6 +111,7 @@ def test_a_network_in_which_nothing_is_free_is_informed(folder, tmp_path, capsys
     assert "--held-out: expected a number from 0 to 0.9, got 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypatch):
     """The interrupt comes at the third look at how far the search has come."""
     from heliograph.learning import fitting

@@ -51,6 +51,7 @@ def recorded(readme, recording):
     return hg.run(readme, {"cart": recording[0]}, inputs=recording[1]).estimates["cart"]
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", ["relay_aware", "mean_gain"])
 @pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-4)])

@@ -31,6 +31,7 @@ def drawn(random, size, usual):
     return np.where(random.random(size) < 0.1, absurd, usual * random.normal(size=size))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)

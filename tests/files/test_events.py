@@ -171,6 +171,7 @@ def test_playing_gives_final_and_lagged_estimates(network):
     np.testing.assert_allclose(late.mean[0], alone.estimates["cart"]["f"].mean[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_command_takes_events(tmp_path, capsys):
     (tmp_path / "net.py").write_text(NETWORK)
     data, out = written(tmp_path / "events.csv", HEADER, ROWS), tmp_path / "est.csv"

@@ -30,6 +30,7 @@ def test_steps_are_silent_once_the_watermark_has_passed_them():
     assert abs(line.estimates()["a"]["f"].mean[0] - before.mean[0]) > 0.3
 
 
+@pytest.mark.slow
 def test_the_timeline_is_the_filter_on_all_steps_with_their_silences():
     line, rows = hg.Timeline(network(), window=0), [0.2, np.nan, np.nan, 1.0, np.nan, np.nan]
     for k, value in enumerate(rows):

@@ -92,6 +92,7 @@ COMBINED = {  # channel, entry of H, E[entry_k entry_(k+1)]
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMBINED)
 def test_the_state_survives(name):
     """Over two steps the product of gains has its exact mean, which draws without a state would miss."""

@@ -17,6 +17,7 @@ def relayed():
     return hg.amplify_and_forward([first, adding, hg.parallel([hg.perfect(), hg.erasure(hg.perfect(), 0.9)])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [HALF, hg.model.with_direct_link(HALF, hg.perfect()), relayed()])
 def test_outcomes_are_those_of_draws(channel):
     """Frequencies of each set of losses in 4,000 draws, within 4 standard errors, and the mean map of what arrived."""

@@ -177,6 +177,7 @@ def sent_step_by_step(fusion, record, run):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["static", "escape", "by component"])
 def test_quantizers_in_the_scan_are_quantizers_in_a_loop(record, name):
     fusion, uplink = FUSED[name], record.uplinks[name]

@@ -38,6 +38,7 @@ def test_the_summary(outcome):
     assert summary["past_states_claim"] == 0.6
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_figure_and_filter(outcome, fits):
     pytest.importorskip("jinja2")
     drawn = delays.figures(outcome)

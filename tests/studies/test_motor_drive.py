@@ -132,6 +132,7 @@ def test_scores_of_made_up_errors():
     assert score.nees_per_dimension["low"] < score.nees_per_dimension["mean"] < score.nees_per_dimension["high"]
 
 
+@pytest.mark.slow
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     truth = np.tile(RUNNING[:5] / RATED[:5], (4000, 1))
     result = compute.received(truth, 0)
@@ -164,6 +165,7 @@ def test_refuses_settings_that_are_none(change, words):
         motor_drive.Setting(**change)
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_model_is_the_simulator_s_machine():
     result = machine.simulate_drive(loaded=False)
@@ -180,6 +182,7 @@ def test_the_model_is_the_simulator_s_machine():
     assert np.max(np.abs(ends - result.truth[1:, :5])) < 1.3e-6
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_simulator_s_speed_obeys_torque_and_load():
     result = machine.simulate_drive().truth * RATED

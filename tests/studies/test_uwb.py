@@ -99,6 +99,7 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path, write_bad, messag
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_drives_with_other_anchors_teach_each_other(tmp_path):
     """One drive lacks an anchor in its tables: it is read, and its rows are those that it has alone."""
     rows, truth = made(0, 20.0)

@@ -33,6 +33,7 @@ def judged(item, z, exact):
     return np.sqrt(square.mean() / variance.mean()), np.mean(square / result.covariance[:, 0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "link"), [pytest.param(hg.perfect(), forgetful(0.0), marks=pytest.mark.slow), (LOSSY, forgetful(0.2))]
 )
@@ -68,6 +69,7 @@ def test_the_posterior_of_silence_has_no_more_covariance_than_silence_skipped():
     assert np.all(variance <= skipped * (1 + 1e-4))  # 1e-4: the grid
 
 
+@pytest.mark.slow
 def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     trigger = hg.SendOnDelta(5.0, heartbeat=1)
     z, _ = simulated(LOSSY, trigger, 40)
@@ -210,6 +212,7 @@ def innovations(item, state, z):
     return jax.vmap(lambda value: item.correct(state, value[None])[1])(z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["zero", "prediction"])
 @pytest.mark.parametrize("link", [hg.perfect(), hg.hop(0.7, noise=0.05)], ids=["perfect", "hop"])
 def test_what_a_stochastic_sender_sends_is_judged_given_that_it_was_sent(link, reference):

@@ -57,6 +57,7 @@ FILTERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_it_is_the_filter_it_is_made_of(name):
     """Equal to rounding where components are missing, one or all: 1e-11 deviations, since curved filters amplify it.

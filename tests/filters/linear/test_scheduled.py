@@ -80,6 +80,7 @@ def test_nothing_arrives_for_a_while():
     np.testing.assert_allclose(bounds, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_saved_gains_tell_that_their_covariance_is_lost():
     s, data = model(EXAMPLE, HORIZON), measurements(1)
     data[4] = np.nan

@@ -225,6 +225,7 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
             assert ours.covariance == pytest.approx(np.asarray(theirs.covariance[0]), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_one_way_ring_is_not_starved():
     """Two nodes of opposite sides know a state each: a share by trace alone follows the one that is nearer."""
     names = [f"n{i:02}" for i in range(12)]

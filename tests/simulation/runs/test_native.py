@@ -121,6 +121,7 @@ def test_records_are_those_of_xla(by_engine):
             assert item.claim == true.claim
 
 
+@pytest.mark.slow
 def test_statistics_are_those_of_xla(by_engine):
     (_, result), (_, expected) = by_engine
     for node, filters in expected.items():
