@@ -89,6 +89,7 @@ def apart(first, second):
     return np.maximum(*gaps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "m"), SIZES)
 @pytest.mark.parametrize("build", [hg.cubature_filter, hg.extended_filter, hg.linear_filter])
 def test_bounds_stay_positive_semidefinite(build, n, m):

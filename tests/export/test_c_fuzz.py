@@ -51,6 +51,7 @@ def test_no_number_spoils_a_device(name, precision, tmp_path):
     assert refused > 0.02 * STEPS
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", FILTERS)

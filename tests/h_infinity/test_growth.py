@@ -46,6 +46,7 @@ SMOOTH = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_a_true_constant_is_proved_and_no_sample_exceeds_the_bound(name):
     function, constant = SMOOTH[name]

@@ -45,6 +45,7 @@ def test_the_timeline_is_the_filter_on_all_steps_with_their_silences():
     np.testing.assert_allclose(result.covariance, last.covariance, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_sender_that_misses_its_heartbeat_is_dead_not_constant():
     line = hg.Timeline(network(hg.perfect()), window=0)
     line.push("a", 0, 0.0, [0.2])

@@ -37,6 +37,7 @@ def test_what_is_late_stands_where_it_was_sent():
     np.testing.assert_array_equal(known.sample(jax.random.key(0))[:-1, -1], [0, 1])
 
 
+@pytest.mark.slow
 def test_a_relay_holds_what_it_drew():
     """Draws of relays that are late by chance: what was drawn a step before stands one place further on."""
     channel = hg.amplify_and_forward([LINK, hg.hop(1.0, 0.0, delay=hg.Discrete([0, 1], [0.5, 0.5]))])

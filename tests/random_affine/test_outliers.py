@@ -16,6 +16,7 @@ def drawn(law, count=100_000):
         return np.asarray(jax.jit(jax.vmap(law.sample))(jax.random.split(jax.random.key(1), count)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [
@@ -42,6 +43,7 @@ def test_one_sided_noise_has_mean_and_variance_of_an_exponential_delay():
     np.testing.assert_allclose([law.mean[0], law.covariance[0, 0]], [0.6, 1.5 + 0.3 * 8 - 0.36], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_share_and_delay_of_a_one_sided_law_can_be_free():
     """d/d(share) of the mean, share times the delay's mean."""
     slope = jax.grad(lambda share: hg.Contaminated.one_sided(1.5, share, 2.0).mean[0])(0.3)

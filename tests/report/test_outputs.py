@@ -55,6 +55,7 @@ def test_only_a_filter_that_the_network_relies_on_blames_an_output_where_it_weig
     assert items[0].summary == items[2].summary
 
 
+@pytest.mark.slow
 def test_the_page_and_the_last_lines_have_the_same_numbers(recorded, tmp_path, fits, monkeypatch, capsys):
     health = examine(NETWORK, hg.run(NETWORK, {"tank": recorded}), np.zeros((STEPS, 0)))
     assert [item.weighs for item in health.outputs] == [True, True, False, False]

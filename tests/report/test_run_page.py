@@ -37,6 +37,7 @@ def health():
     return examine(NETWORK, hg.run(NETWORK, received), np.zeros((STEPS, 0)))
 
 
+@pytest.mark.slow
 def test_claims_are_judged_by_innovations(health):
     good, sure = (next(filter_ for filter_ in health.filters if filter_.filter == name) for name in ("good", "sure"))
     assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.significant
@@ -174,6 +175,7 @@ def test_a_network_whose_only_filter_is_the_fused_one_runs(tmp_path, monkeypatch
     assert "fused: estimates with bands" in page and "fused/centre" in page
 
 
+@pytest.mark.slow
 def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
     """Behind a gain that is random, the filter that takes its mean is too sure; the network relies on the exact one."""
     sensor = hg.LinearSensor([[1.0]], 0.1, outputs={"height": "m"})

@@ -36,6 +36,7 @@ def test_the_summary(outcome):
     assert summary["rules"]["best"]["nees"] == [0.9, 1.0] and "positions" not in summary
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_figure_and_rule(outcome, fits):
     pytest.importorskip("jinja2")
     drawn = without_centre.figures(outcome)

@@ -73,6 +73,7 @@ def test_links_that_remember_and_losses_that_are_informed():
     assert check_scaling(hg.Network(plant, nodes), steps=3) <= 1
 
 
+@pytest.mark.slow
 def test_a_flag_has_no_unit():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     channel = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.hop(0.3, 0.2), 0.2, 0.4)

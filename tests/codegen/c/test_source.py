@@ -113,6 +113,7 @@ def looked_up(x):
     return jax.lax.dynamic_index_in_dim(table, jnp.floor(jnp.abs(x[2]) * 40).astype(int), keepdims=False), table[3]
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     "function", [arithmetic, functions, whole_numbers, choices, guarded, repeated, until, looked_up]
@@ -123,6 +124,7 @@ def test_it_computes_what_the_function_does(function, tmp_path):
     np.testing.assert_allclose(result, right, rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("function", [arithmetic, functions, guarded, looked_up])
 def test_in_single_precision(function, tmp_path):

@@ -79,6 +79,7 @@ def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     np.testing.assert_allclose(result.covariance, kalman.covariance, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_delta_near_zero_is_the_kalman_filter_with_erasures():
     trigger = hg.SendOnDelta(1e-5)
     z, _ = simulated(LOSSY, trigger, 60)

@@ -149,6 +149,7 @@ def corner_cases():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", corner_cases(), ids=lambda channel: type(channel).__name__)
 def test_moments_at_corners_are_those_of_the_extremes(channel):
     """Their entries are sums of a few dozen terms of one size, in another order: equal to rounding."""

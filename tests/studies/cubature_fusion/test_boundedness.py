@@ -13,6 +13,7 @@ def linear(matrix):
     return hg.LinearPlant(matrix, 0.1 * np.eye(2), [0.0, 0.0], np.eye(2))
 
 
+@pytest.mark.slow
 def test_gains_are_those_of_the_analytic_jacobian():
     states = np.random.default_rng(0).normal(size=(20, 5))
     result = growth_condition(plant(PRINTED), states, 1e-6)

@@ -27,6 +27,7 @@ def test_the_extended_filter_takes_it():
     check_extended(LooseInterval(FIXED), oracle.printed_terms)
 
 
+@pytest.mark.slow
 def test_one_step_is_looser_than_the_right_sign():
     printed, tight = (one_step(rule(FIXED))[3] for rule in (LooseInterval, hg.filters.Interval))
     assert np.trace(printed) == pytest.approx(0.082413, abs=6e-7)  # six printed digits
@@ -37,6 +38,7 @@ def test_optimal_scalars_beat_every_fixed_pair():
     check_optimal_scalars(LooseInterval)
 
 
+@pytest.mark.slow
 def test_theorem_1_holds_by_enumeration_where_no_mean_is_within_its_radius():
     """With a gain's radius above its mean the printed step fails."""
     check_by_enumeration(LooseInterval, lambda s: all(abs(v @ p) >= np.abs(v) @ r for v, p, r in (s["xi"], s["gamma"])))

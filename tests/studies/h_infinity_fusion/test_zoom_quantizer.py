@@ -8,6 +8,7 @@ from heliograph_studies.h_infinity_fusion.setting import ZoomQuantizer
 from tests.fusion.test_quantizer import check_no_number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [3.0, [3.0, 2.0]])
 def test_contract(amplitude):
     zoom = ZoomQuantizer(41, amplitude, 0.6, 0.15)

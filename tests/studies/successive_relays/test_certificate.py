@@ -28,6 +28,7 @@ def scalar(transition, initial, mean=0.5):
     return RelayNetwork(plant, LinearSensor([[1.0]], [[1.0]]), ("a", "b"), slots)
 
 
+@pytest.mark.slow
 def test_the_bounds_of_the_example(paper):
     bounds = paper.bounds
     assert paper.constants["tau_upper"] == pytest.approx(1.2616, abs=5e-5)
@@ -71,6 +72,7 @@ def test_every_bound_can_fail():
         assert not bounds[name].applies and bounds[name].holds is False
 
 
+@pytest.mark.slow
 def test_a_network_of_another_kind_gets_the_bounds_that_still_make_sense():
     net = unusual()
     bounds = certify_relays(net, local_error_design(net, 9).gains).bounds
