@@ -128,7 +128,7 @@ def test_its_covariance_is_its_error_over_all_paths_given_the_flags(flags):
 
 
 CHAIN = hg.random_affine.MarkovChain(BURSTS)
-IN_SHARED_FADING = hg.parallel(
+FADING_APART = hg.parallel(
     [hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in ((0.2, 0.4), (1.0, p))], CHAIN) for p in (0.9, 0.8)]
 )
 TWICE = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
@@ -145,7 +145,7 @@ WORLDS = {  # channel, filter, the mean variance in the long run
     ),
     "mode now": (hg.model.with_flag(bursts()), known_filter(PLANT, SENSOR, bursts()), 0.0935),
     "drifts one step late": (hg.model.with_flag(DRIFTS, late=True), late_filter(PLANT, SENSOR, DRIFTS), None),
-    "two lossy links in one shadow": (IN_SHARED_FADING, hg.linear_filter(PLANT, TWICE, IN_SHARED_FADING), None),
+    "two lossy links, each in its shadow": (FADING_APART, hg.linear_filter(PLANT, TWICE, FADING_APART), None),
 }  # fmt: skip
 
 
@@ -154,7 +154,7 @@ TOGETHER = [
     ["losses", "mode now"],
     ["mode by flag", "flags"],
     ["mode one step late", "drifts one step late"],
-    ["two lossy links in one shadow"],
+    ["two lossy links, each in its shadow"],
 ]
 
 
@@ -164,7 +164,7 @@ def record(request):
     nodes = {}
     for name in request.param:
         world, item, _ = WORLDS[name]
-        nodes[name] = hg.Node(TWICE if world is IN_SHARED_FADING else SENSOR, world, {"f": item})
+        nodes[name] = hg.Node(TWICE if world is FADING_APART else SENSOR, world, {"f": item})
     return hg.monte_carlo(hg.Network(PLANT, nodes), CONVERGED.stop, RUNS, 2)
 
 
