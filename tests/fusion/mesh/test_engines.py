@@ -59,7 +59,7 @@ def test_graphs_by_the_hundred_are_left_to_xla(rule, nodes, long):
 
 @pytest.mark.slow
 def test_large_decompositions_of_two_lanes_do_not_wait_for_each_other():
-    """Five nodes of eight states, whose weights are of 24 rows: it once never ended, with two lanes on two threads."""
+    """Five nodes of eight states, with weights of 24 rows: it once never ended, with two lanes on two threads."""
     random, names = np.random.default_rng(0), "abcde"
     plant = hg.LinearPlant(0.9 * np.eye(8) + 0.02 * random.normal(size=(8, 8)), 0.1 * np.eye(8), np.zeros(8), np.eye(8))
     sensor = hg.LinearSensor(random.normal(size=(2, 8)), 0.5 * np.eye(2))

@@ -66,7 +66,7 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     """Compute e^-|x| I_0(x) or e^-|x| I_1(x): a power series up to |x| = 30, beyond it the asymptotic one.
 
     I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!); of v = 0 and 1 it is e^x / root(2 pi x) (1 + sum_k a_k) with
-    a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), whose terms fall to 1e-26 at 30.
+    a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), terms that fall to 1e-26 at 30.
 
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
     """
