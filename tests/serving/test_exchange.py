@@ -229,7 +229,7 @@ def test_of_three_processes_one_is_killed_and_catches_up(kind: str, tmp_path: Pa
     from heliograph_studies.live.server import Server
     from tests.serving.broker_servers import at, published, sent
 
-    steps, results = 300, dict[tuple[str, str], dict[int, dict[str, list]]]()
+    steps, results = 500, dict[tuple[str, str], dict[int, dict[str, list]]]()
     record = simulated(steps, 5)
 
     async def taken(message: "nats.aio.msg.Msg") -> None:
@@ -265,7 +265,7 @@ def test_of_three_processes_one_is_killed_and_catches_up(kind: str, tmp_path: Pa
         k = 0
         while min(map(newest, "abc")) < 3:
             await measure(k)
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.25)
             k += 1
         # One is killed; the others go on.
         processes["b"].kill()
