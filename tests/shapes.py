@@ -7,7 +7,7 @@ becomes an array, is not checked here: its shape is for the reader.
 import inspect
 import sys
 from collections.abc import Callable
-from functools import partial, update_wrapper
+from functools import cache, partial, update_wrapper
 from types import FunctionType, NoneType, UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -58,8 +58,9 @@ def once_a_kind(function: FunctionType, shaped: dict[str, Any], typechecker: Any
     def given(*args: Any, **kwargs: Any) -> Any:
         return computed.pop()
 
-    whole = JAXTYPED(function, typechecker=typechecker)
-    signature = inspect.signature(function)
+    @cache
+    def whole() -> Callable[..., Any]:  # made at the first call: a file of tests calls a few of them
+        return JAXTYPED(function, typechecker=typechecker)
 
     def check(args: Any, kwargs: Any, **returned: Any) -> None:
         """Check the annotations around what is returned already, if anything is, for tuples of these lengths."""
@@ -69,6 +70,7 @@ def once_a_kind(function: FunctionType, shaped: dict[str, Any], typechecker: Any
         if (key := tuple(hints.items())) not in checks:
             again = FunctionType(given.__code__, function.__globals__, function.__name__, None, given.__closure__)
             update_wrapper(again, function).__annotations__ = hints
+            signature = inspect.signature(function)
             known = [p.replace(annotation=hints.get(p.name, p.empty)) for p in signature.parameters.values()]
             returns = hints.get("return", signature.empty)
             again.__signature__ = signature.replace(parameters=known, return_annotation=returns)
@@ -85,7 +87,7 @@ def once_a_kind(function: FunctionType, shaped: dict[str, Any], typechecker: Any
         if key not in accepted:
             if any_length:
                 check(args, kwargs)
-            outcome = whole(*args, **kwargs)
+            outcome = whole()(*args, **kwargs)
             if any_length:
                 check(args, kwargs, **{"return": outcome})
             accepted[key] = {_kind(outcome)}
