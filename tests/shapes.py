@@ -133,10 +133,10 @@ def _of_entries(hint: Any, value: Any) -> Any:
     if get_origin(hint) is not tuple or not isinstance(value, tuple):
         return hint
     parts = get_args(hint)
-    each = [parts[0]] * len(value) if Ellipsis in parts else parts
-    if len(each) != len(value):
+    entries = [parts[0]] * len(value) if Ellipsis in parts else parts
+    if len(entries) != len(value):
         return hint
-    return tuple[*map(_of_entries, each, value)] if each else tuple[()]
+    return tuple[*map(_of_entries, entries, value)] if entries else tuple[()]
 
 
 def _evaluated(hint: Any, names: dict[str, Any]) -> Any:
