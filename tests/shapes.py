@@ -6,7 +6,7 @@ becomes an array, is not checked here: its shape is for the reader.
 
 import sys
 from collections.abc import Callable
-from functools import partial, update_wrapper
+from functools import cache, partial, update_wrapper
 from types import FunctionType, NoneType, UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -55,10 +55,14 @@ def once_a_kind(function: FunctionType, shaped: set[str], typechecker: Any) -> C
     def given(*args: Any, **kwargs: Any) -> Any:
         return computed.pop()
 
-    # The same annotations around a result that is there already.
-    renamed = FunctionType(given.__code__, function.__globals__, function.__name__, None, given.__closure__)
-    again = JAXTYPED(update_wrapper(renamed, function), typechecker=typechecker)
-    whole = JAXTYPED(function, typechecker=typechecker)
+    @cache
+    def whole() -> Callable[..., Any]:  # made at the first call: a file of tests calls a few of them
+        return JAXTYPED(function, typechecker=typechecker)
+
+    @cache
+    def again() -> Callable[..., Any]:  # the same annotations around a result that is there already
+        renamed = FunctionType(given.__code__, function.__globals__, function.__name__, None, given.__closure__)
+        return JAXTYPED(update_wrapper(renamed, function), typechecker=typechecker)
 
     def call(*args: Any, **kwargs: Any) -> Any:
         if jaxtyping.config.jaxtyping_disable:
@@ -67,13 +71,13 @@ def once_a_kind(function: FunctionType, shaped: set[str], typechecker: Any) -> C
         key = (*(_kind(args[i]) if i < count else names[i] for i in places),
                *((name, _kind(kwargs[name])) for name in kwargs if name in shaped))  # fmt: skip
         if key not in accepted:
-            outcome = whole(*args, **kwargs)
+            outcome = whole()(*args, **kwargs)
             accepted[key] = {_kind(outcome)}
             return outcome
         outcome = function(*args, **kwargs)
         if "return" in shaped and (kind := _kind(outcome)) not in accepted[key]:
             computed.append(outcome)
-            again(*args, **kwargs)
+            again()(*args, **kwargs)
             accepted[key].add(kind)
         return outcome
 
