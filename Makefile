@@ -51,11 +51,13 @@ clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out docs/_made build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find src studies tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
+# An interpreter of some years comes with a pip that takes half as long again.
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 	  { echo "heliograph needs Python 3.11 or newer and '$(PYTHON)' is not: try make PYTHON=python3.12" >&2; exit 1; }
 	@$(PYTHON) -m venv --clear .venv >/dev/null 2>&1 || \
 	  { echo "'$(PYTHON) -m venv .venv' failed: install venv and pip for it (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	@$(BIN)/python $(INSTALL) --upgrade pip || true
 	@touch $@
 
 .venv/.demo: $(CREATED) pyproject.toml constraints.txt
@@ -72,9 +74,10 @@ $(CREATED):
 	@$(BIN)/python $(COMPILE) || true
 	@touch .venv/.demo $@
 
+# The extra `motor` by its package: with all the others, which are there by now, it takes twenty times as long.
 .venv/.check: .venv/.test
 	@echo "Installing the simulator of a motor drive into .venv ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,motor]'
+	@$(BIN)/python $(INSTALL) -c constraints.txt gym-electric-motor
 	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 

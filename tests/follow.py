@@ -31,15 +31,17 @@ class Followed(NamedTuple):
     state: Any
 
 
-def follow(item: AbstractFilter, z: Any, u: Any = None) -> Followed:
+def follow(item: AbstractFilter, z: Any, u: Any = None, written_out: bool = True) -> Followed:
     """Predict and correct over rows, from the filter's start.
 
-    z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs).
+    z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs). Matrices of many
+    entries are not `written_out`, 100,000 instructions of native code: XLA has each product as one operation.
     """
     z = np.array([measured(item, row) for row in z])
     u = np.array([given(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
     assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
-    return _cut(computed(_scan, _scan_by_xla, (item, *_padded(z, u), np.asarray(len(z)))), len(z), 0)
+    arguments = (item, *_padded(z, u), np.asarray(len(z)))
+    return _cut(computed(_scan, _scan_by_xla, arguments) if written_out else _scan_by_xla(*arguments), len(z), 0)
 
 
 def follow_known(item: AbstractFilter, z: Any, u: Any) -> Followed:

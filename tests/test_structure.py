@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
@@ -61,10 +62,20 @@ def rank(module: str) -> int | None:
     return None
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def statements(path: Path) -> list[ast.ImportFrom]:
+    return [node for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom)]
+
+
 def imports(path: Path) -> set[str]:
     result = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("heliograph."):
+    for node in statements(path):
+        if node.module and node.module.startswith("heliograph."):
             module = node.module.removeprefix("heliograph.")
             result |= {
                 f"{module}.{alias.name}" if rank(f"{module}.{alias.name}") is not None else module
@@ -88,16 +99,16 @@ def test_imports_never_go_round():
     """Those for type checkers and those inside functions are counted too; the error names the circle."""
     graph = {}
     for path in FILES:
-        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
-        graph[".".join(path.relative_to(SOURCE.parent).with_suffix("").parts)] = {node.module for node in nodes}
+        name = ".".join(path.relative_to(SOURCE.parent).with_suffix("").parts)
+        graph[name] = {node.module for node in statements(path)}
     assert "heliograph.filters.rows" in graph["heliograph.filters.base"]  # it sees what there is
     TopologicalSorter({name: {m for m in graph[name] if m in graph} for name in graph}).prepare()
 
 
 def _raises(function) -> bool:
     """Whether a function's own body has a `raise`; what it calls says so itself."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    return any(isinstance(node, ast.Raise) for node in ast.walk(tree))
+    body = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    return any(isinstance(node, ast.Raise) for node in ast.walk(body))
 
 
 HALL = [name for name in heliograph.__all__ if not inspect.ismodule(getattr(heliograph, name))]
@@ -144,7 +155,7 @@ def test_every_room_says_what_it_is():
 
 def test_no_public_function_is_without_a_docstring():
     for path in FILES:
-        for node in ast.parse(path.read_text()).body:
+        for node in tree(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 if any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list):
                     continue  # the function itself says it

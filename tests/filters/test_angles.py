@@ -49,7 +49,7 @@ def filters(plant: hg.Plant, sensor: hg.Sensor) -> dict[str, hg.filters.Abstract
         "imm": hg.filters.imm_filter(plant, sensor, MODES),
         "gpb1": hg.filters.gpb1_filter(plant, sensor, MODES),
         "gpb2": hg.filters.gpb2_filter(plant, sensor, MODES),
-        "particle": hg.filters.particle_filter(plant, sensor, MODES, particles=20),
+        "particle": hg.filters.particle_filter(plant, sensor, MODES, particles=5),
         "open_loop": hg.filters.open_loop_filter(plant),
     }
 

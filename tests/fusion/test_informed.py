@@ -6,6 +6,7 @@ from tests.fusion.fusion_problems import case, network, random_case, rules, two_
 from tests.oracles.shared_information import local_gains, stacked_errors
 
 RULES = ("scalar", "matrix", "matrix_with_mean", "all_reports")
+WRONG = ("node 0", "node 2", "node 3")
 TARGETS = {  # traces after 200 steps, by these rules and of the central filter
     "three_partial": (79.36, 5.130159, 5.130159, 5.097404, 5.097404),
     "three_rooms": (0.8298, 0.326248, 0.325936, 0.325670, 0.325670),
@@ -76,17 +77,13 @@ def test_cross_covariances_are_those_of_the_stacked_problem(seed):
 
 @pytest.fixture(scope="module")
 def world():
-    """Five nodes, each with a second filter that trusts the mean gain and starts where it likes; every rule."""
+    """Five nodes; three have a second filter that trusts the mean gain and starts where it likes; every rule."""
     plant, parts = random_case(11, nodes=5, n=2)
-    nodes = {
-        name: hg.Node(
-            node.sensor,
-            node.channel,
-            node.filters
-            | {"wrong": hg.mean_gain_filter(plant, node.sensor, node.channel, initial_mean=np.ones(len(plant.states)))},
-        )
-        for name, node in network(plant, parts, {}).nodes.items()
-    }
+    nodes = dict(network(plant, parts, {}).nodes)
+    for name in WRONG:
+        sensor, channel, filters = nodes[name].sensor, nodes[name].channel, nodes[name].filters
+        wrong = hg.mean_gain_filter(plant, sensor, channel, initial_mean=np.ones(len(plant.states)))
+        nodes[name] = hg.Node(sensor, channel, filters | {"wrong": wrong})
     return hg.Network(plant, nodes, rules() | {"wrong": hg.Fusion("wrong", hg.fusion.MatrixWeights())})
 
 
@@ -106,7 +103,7 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
         error = square.std() / np.sqrt(len(square))
         assert abs(square.mean() - np.trace(estimate.covariance[0, -1])) < 3 * error, name
         assert estimate.claim == "exact"
-    assert {record.estimates[name]["wrong"].claim for name in world.names} == {"nominal"}
+    assert {record.estimates[name]["wrong"].claim for name in WRONG} == {"nominal"}
     trace = {name: np.trace(e.covariance[0, -1]) for name, e in record.estimates["fused"].items()}
     assert trace["all_reports"] <= trace["matrix"] * (1 + 1e-12) and trace["matrix"] <= trace["diagonal"]
     assert trace["matrix_with_mean"] <= trace["matrix"] and trace["diagonal"] <= trace["scalar"]

@@ -15,9 +15,9 @@ EXAMPLE = oracle.paper_example()
 HORIZON = 10
 
 
-def run(item, data):
+def run(item, data, written_out=True):
     """Means and covariances after each measurement."""
-    return follow(item, data)[:2]
+    return follow(item, data, written_out=written_out)[:2]
 
 
 def measurements(outputs, seed=0):
@@ -43,7 +43,7 @@ def test_estimates_are_the_papers():
 def test_saved_gains_are_the_recursion(degree):
     s, data = model(EXAMPLE, HORIZON), measurements(1)
     saved = run(hg.filters.scheduled_polynomial_filter(*s, HORIZON, degree), data)
-    online = run(hg.polynomial_filter(*s, HORIZON, degree), data)
+    online = run(hg.polynomial_filter(*s, HORIZON, degree), data, written_out=degree < 3)
     for a, b in zip(saved, online, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * max(np.abs(b).max(), 1))
 

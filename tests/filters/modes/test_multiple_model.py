@@ -15,7 +15,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.05)
 CHAIN = [[0.95, 0.05], [0.03, 0.97]]
 LINK = hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
 DATA = [0.3, -1.2, 0.8, 1.5, -0.4, 0.9]
-LARGE, FEW = 20_000, 50  # particles
+LARGE, FEW = 20_000, 34  # particles
 WIDE = hg.LinearPlant([[0.9, 0.2], [-0.1, 0.8]], [[0.3, 0.1], [0.1, 0.2]], [1.0, -0.5], np.eye(2))
 BOTH = hg.LinearSensor([[1.0, 0.0], [1.0, 1.0]], 0.2 * np.eye(2))
 FILTERS = [hg.filters.gpb1_filter, hg.filters.imm_filter, hg.filters.gpb2_filter]
