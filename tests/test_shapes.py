@@ -66,4 +66,20 @@ def test_a_function_without_shapes_and_a_class_stay_as_they_were():
         return x
 
     assert where_shaped(plain, typechecker=checked) is plain
-    assert once_a_kind(moved, {"matrix"}, checked).__wrapped__ is moved
+    assert once_a_kind(moved, {"matrix": moved.__annotations__["matrix"]}, checked).__wrapped__ is moved
+
+
+def joined(parts: tuple[Float[np.ndarray, "_ n"], ...], other: bool = False) -> tuple[Float[np.ndarray, " n"], ...]:
+    return (*(part.sum(axis=0) for part in parts), *([parts[0]] if other else []))
+
+
+@pytest.mark.parametrize("wrong", [
+    lambda f: f((np.ones((1, 2)), np.ones((2, 2)), np.ones((2, 3)))), lambda f: f((*[np.ones((1, 2))] * 9, np.ones(2))),
+    lambda f: f((*[np.ones((1, 2))] * 9, [1.0])), lambda f: f((np.ones((1, 2)), np.ones((2, 2))), other=True),
+])  # fmt: skip
+def test_each_entry_of_a_tuple_of_any_length_is_checked(wrong):
+    of_parts = where_shaped(joined, typechecker=checked)
+    assert len(of_parts((np.ones((1, 2)), np.ones((2, 2))))) == 2 and of_parts(()) == ()
+    assert len(of_parts((np.ones((1, 2)), np.ones((2, 2)), np.ones((0, 2))))) == 3
+    with pytest.raises(jaxtyping.TypeCheckError):
+        wrong(of_parts)

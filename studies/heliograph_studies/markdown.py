@@ -22,6 +22,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, TemplateError
@@ -93,14 +94,20 @@ def filled(template: Path, numbers: Mapping[str, object]) -> str:
     Raises:
         ValueError: a template that puts in what is not there.
     """
-    environment = Environment(
-        loader=FileSystemLoader(template.parent), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"fmt": format, "pm": with_error}
     try:
-        return environment.get_template(template.name).render(numbers)
+        return _environment(template.parent).get_template(template.name).render(numbers)
     except TemplateError as error:
         raise fail(f"page {template}", "a template of what was found", error) from error
+
+
+@cache
+def _environment(folder: Path) -> Environment:
+    """The templates of a folder, each compiled once."""
+    environment = Environment(
+        loader=FileSystemLoader(folder), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"fmt": format, "pm": with_error}
+    return environment
 
 
 def with_error(pair: tuple[float, float], digits: str = "") -> str:

@@ -14,7 +14,7 @@ from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import RANK
 from heliograph.numerics.lapack import pseudo_solve
-from heliograph.numerics.linalg import rounding, symmetrize, with_rounding
+from heliograph.numerics.linalg import rounding, symmetric, with_rounding
 from heliograph.numerics.types import Float
 
 
@@ -117,9 +117,9 @@ def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
         new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
     return Knowledge(
         transition @ state.mean + drift,
-        symmetrize(transition @ state.covariance @ transition.T + new),
+        symmetric(transition @ state.covariance @ transition.T + new),
         _with_new(state.past, happened, links),
-        None if state.spill is None else transition @ state.spill @ transition.T,
+        None if state.spill is None else symmetric(transition @ state.spill @ transition.T),
     )
 
 
@@ -146,11 +146,11 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     unexpected = jnp.where(present, values - expected, 0.0)
     # S = O P O' + N.
     cross = output @ state.covariance
-    total = cross @ output.T + noise
+    total = symmetric(cross @ output.T + noise)
     if state.spill is None:
         cross = jnp.where(present[:, None], cross, 0.0)
         gain = pseudo_solve(_of_present(present, total), cross, rounding(0.0, total, RANK)).T
-        covariance = symmetrize(with_rounding(state.covariance, nodes * n) - gain @ cross)
+        covariance = symmetric(with_rounding(state.covariance, nodes * n) - gain @ cross)
         return Knowledge(state.mean + gain @ unexpected, covariance, state.past, None), Expected(expected, total)
     # Gain for quantizers' errors as white noise of variance D^2 / 3.
     push = _quantized(state.past, present)
@@ -159,10 +159,10 @@ def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -
     gain = pseudo_solve(_of_present(present, total + wide), cross, rounding(0.0, total, RANK)).T
     # Joseph form with that gain; the errors mu themselves enter the bound (Young, Cauchy).
     keep = jnp.eye(len(state.mean)) - gain @ output
-    covariance = symmetrize(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
+    covariance = symmetric(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
     into = gain @ push
     bound = _within(into, jnp.ravel(state.past.error))
-    spill = symmetrize(_sum(keep @ state.spill @ keep.T, bound))
+    spill = symmetric(_sum(keep @ state.spill @ keep.T, bound))
     return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.linear.plan import Plan
-from heliograph.numerics.linalg import cholesky, rounding, symmetrize
+from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
 
@@ -96,7 +96,7 @@ def moved_state(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """E x and Cov x after the step."""
     matrix = jnp.asarray(motion.matrix)
-    return matrix @ mean + motion.shift, matrix @ covariance @ matrix.T + motion.noise
+    return matrix @ mean + motion.shift, symmetric(matrix @ covariance @ matrix.T + motion.noise)
 
 
 def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Errors:
@@ -115,8 +115,9 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
     # T_i P_ij T_j'.
     once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
-    joint = (both + left @ right.T).reshape(nodes, n, nodes, n)
-    return Errors(mean, covariance, bias, moved, joint + observation_noise(step.gain, noise))
+    measured = observation_noise(step.gain, noise).reshape(nodes * n, -1)
+    joint = symmetric(both + left @ right.T + measured).reshape(nodes, n, nodes, n)
+    return Errors(mean, covariance, bias, moved, joint)
 
 
 class Factors(NamedTuple):

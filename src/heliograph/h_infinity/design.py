@@ -111,12 +111,18 @@ def recursive_design(
     if design is not None and (design.feasible or not search):
         return design
     guess = recursion.coordinates.unit if level is None else level
-    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, guess)
+    tried: dict[float, HInfinityDesign] = {}
+
+    def works(trial: float) -> bool:
+        tried[trial] = recursion.run(trial, start)
+        return tried[trial].feasible
+
+    smallest = _smallest(works, guess)
     if design is not None:
         return design._replace(smallest_level=smallest)
     if smallest is None:
         raise fail("smallest level", f"one below {SEARCH_LIMIT:g} times the norm of M", "none that works")
-    return recursion.run(smallest, start)
+    return tried[smallest]
 
 
 def horizon_design(

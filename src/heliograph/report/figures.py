@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from heliograph.simulation.results.plots import COLOURS
@@ -60,7 +61,7 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
     buffer, before = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     figure.dpi = dots_per_inch
-    canvas: Any = FigureCanvasAgg(figure)  # it has no types; it draws once, where savefig draws twice
+    canvas: Any = FigureCanvasAgg(figure)  # it has no types; it draws once, where savefig lays out and draws twice
     canvas.print_png(buffer)
     figure.dpi = before
     return buffer.getvalue()
@@ -70,5 +71,7 @@ def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
 def svg(figure: Figure) -> bytes:
     """Export the figure as SVG with its text as outlines, the same bytes for the same figure."""
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
+    figure.set_facecolor("white")
+    canvas: Any = FigureCanvasSVG(figure)
+    canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

@@ -170,10 +170,9 @@ def _random_channel(rng: np.random.Generator) -> tuple[Channel, tuple[Array, Arr
         p = rng.dirichlet(np.ones(3))
         radius = reach * rng.uniform(0, 1, 3) * np.maximum(p, 1 - p)
         law = hg.Discrete(rng.uniform(0, 1, 3), p, radius)
-        corners = [corner for corner in law.extremes() if isinstance(corner, hg.Discrete)]
-        corner = corners[rng.integers(len(corners))]
+        corners = np.asarray(law.corners())
         laws.append(law)
-        truth.append(np.asarray(corner.probabilities))
+        truth.append(corners[rng.integers(len(corners))])
     return Channel(float(rng.uniform(0.1, 2)), 1.0, 1e-4 * np.eye(2), 1e-4 * np.eye(2), laws[0], laws[1]), (
         truth[0],
         truth[1],

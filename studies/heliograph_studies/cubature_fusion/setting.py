@@ -168,8 +168,13 @@ def _transition(voltage: float, torque: float) -> Transition:
 
 def plant(s: Scenario) -> hg.Plant:
     """Flux (x1 to x4) and angular velocity (x5)."""
+    return _plant(transition(s), s.process_noise, s.initial_variance)
+
+
+@cache
+def _plant(transition: Transition, process_noise: float, initial_variance: float) -> hg.Plant:
     eye = np.eye(5)
-    return hg.Plant(transition(s), s.process_noise * eye, START, s.initial_variance * eye, STATES)
+    return hg.Plant(transition, process_noise * eye, START, initial_variance * eye, STATES)
 
 
 def sensor(s: Scenario, node: int) -> hg.LinearSensor:
