@@ -204,10 +204,10 @@ def test_a_scheduler_that_dies_is_one_line_and_the_next_run_goes_on(tmp_path, ex
     from dask import config
     from distributed import LocalCluster
 
-    monkeypatch.setenv("PAUSE", "0.2")
-    monkeypatch.setattr(engines, "CONNECT", 2)
+    monkeypatch.setenv("PAUSE", "0.1")
+    monkeypatch.setattr(engines, "CONNECT", 1)
     campaign, out = write(tmp_path), tmp_path / "out"
-    impatient = config.set({"distributed.comm.timeouts.connect": "1s"})  # a worker that looks for its scheduler
+    impatient = config.set({"distributed.comm.timeouts.connect": "0.5s"})  # a worker that looks for its scheduler
     with impatient, LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
 
         def end(what, done, total):

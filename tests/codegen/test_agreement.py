@@ -16,8 +16,9 @@ from heliograph.numerics.over_runs import runs_last
 RANDOM = np.random.default_rng(4)
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 0.5]], 0.3)
-TEN = hg.LinearPlant(np.diag([0.9] * 10) + np.diag([0.1] * 9, 1), 0.1 * np.eye(10), np.zeros(10), np.eye(10))
-FIRST = hg.LinearSensor(np.eye(1, 10), 0.3)
+NINE = hg.LinearPlant(np.diag([0.9] * 9) + np.diag([0.1] * 8, 1), 0.1 * np.eye(9), np.zeros(9), np.eye(9))
+FIRST = hg.LinearSensor(np.eye(1, 9), 0.3)
+LEVEL, READ = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.3)
 TURNING = hg.Plant(lambda x, u: 0.8 * x + 0.3 * jnp.sin(jnp.roll(x, 1)), 0.1 * np.eye(2), np.ones(2), np.eye(2))
 BENT = hg.Sensor(lambda x: (x[0] + 0.2 * x[1] ** 2)[None], 0.1)
 RELAYS = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), 0.02), hg.hop(1.0, noise=0.01, amplification=1.2)])
@@ -31,15 +32,15 @@ FILTERS = {
     "extended": lambda: hg.extended_filter(TURNING, BENT, RELAYS),
     "cubature": lambda: hg.cubature_filter(TURNING, BENT, UNCERTAIN),
     "imm": lambda: hg.filters.imm_filter(PLANT, SENSOR, FADING),
-    "gpb2": lambda: hg.filters.gpb2_filter(PLANT, SENSOR, FADING),
+    "gpb2": lambda: hg.filters.gpb2_filter(LEVEL, READ, FADING),
     "polynomial": lambda: hg.polynomial_filter(PLANT, SENSOR, RELAYS, 30, 1),
 }
 LARGE = {
-    "kalman": lambda: hg.kalman_filter(TEN, FIRST),
-    "linear with memory": lambda: hg.linear_filter(TEN, FIRST, FADING),
-    "cubature": lambda: hg.cubature_filter(TEN, FIRST, UNCERTAIN),
-    "imm": lambda: hg.filters.imm_filter(TEN, FIRST, FADING),
-    "gpb1": lambda: hg.filters.gpb1_filter(TEN, FIRST, FADING),
+    "kalman": lambda: hg.kalman_filter(NINE, FIRST),
+    "linear with memory": lambda: hg.linear_filter(NINE, FIRST, FADING),
+    "cubature": lambda: hg.cubature_filter(NINE, FIRST, UNCERTAIN),
+    "imm": lambda: hg.filters.imm_filter(NINE, FIRST, FADING),
+    "gpb1": lambda: hg.filters.gpb1_filter(NINE, FIRST, FADING),
 }
 
 

@@ -175,8 +175,7 @@ def test_noises_and_moments_of_every_map_can_be_traced():
         return item.moments(1).matrix, item.moments(4).matrix, push(item, 4, np.ones(15))
 
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
-    with jax.enable_x64(True):
-        single, two, pushed = jax.jit(evaluate)(p)
+    single, two, pushed = computed(evaluate, jax.jit(evaluate), (p,))
     np.testing.assert_allclose(single, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(two, make(p).moments(4).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
@@ -192,8 +191,11 @@ def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
         return relayed, hg.model.with_direct_link(relayed, hg.hop(hg.Rayleigh(p[2]), 0.1))
 
     p = np.array([0.2, 1.3, 0.9])
-    with jax.enable_x64(True):
-        traced = jax.jit(lambda p: [hg.random_affine.second_order(channel) for channel in make(p)])(p)
+
+    def described(p):
+        return [hg.random_affine.second_order(channel) for channel in make(p)]
+
+    traced = computed(described, jax.jit(described), (p,))
     known = [hg.random_affine.second_order(channel) for channel in make(p)]
     for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(known), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)

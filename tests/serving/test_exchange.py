@@ -24,23 +24,11 @@ from heliograph.serving.running import ServiceSettings, of_node
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store_protocol import InMemoryStore
 from heliograph.simulation.centres.node_filter import node_network
+from tests.serving.neighbours import PLANT, chain
 
 ROOT = Path(hg.__file__).parents[2]
 
-PLANT = hg.LinearPlant([[1.0, 0.3], [0.0, 0.95]], 0.1 * np.eye(2), [1.0, 0.0], np.eye(2))
-NEAR = {"a": ["b"], "b": ["a", "c"], "c": ["b"]}
 STEPS = 12
-
-
-def chain(rule: hg.fusion.AbstractFusion | None = None, **options: object) -> hg.Network:
-    """Two nodes that measure one state each, and one between them that has no sensor."""
-    parts: dict[str, hg.Node | None] = {"b": None}
-    for name, row in (("a", [1.0, 0.0]), ("c", [0.0, 1.0])):
-        sensor = hg.LinearSensor([row], 0.3)
-        parts[name] = hg.Node(sensor, hg.perfect(), {"alone": hg.kalman_filter(PLANT, sensor)})
-    item = hg.Fusion("alone", rule or hg.fusion.TraceIntersection(), neighbours=NEAR, **options)  # type: ignore[arg-type]
-    return hg.Network(PLANT, {name: parts[name] for name in "abc"}, {"mesh": item})
-
 
 LOSSY = hg.erasure(hg.perfect(), 0.7)
 QUANTIZER = hg.fusion.UniformQuantizer(41, 0.7)
@@ -221,7 +209,7 @@ class Process:
     """`heliograph serve --node NAME`, with a store of its own."""
 
     def __init__(self, folder: Path, node: str, broker: str):
-        (folder / "network.py").write_text("from tests.serving.test_exchange import chain\nnetwork = chain()\n")
+        (folder / "network.py").write_text("from tests.serving.neighbours import chain\nnetwork = chain()\n")
         command = [sys.executable, "-m", "heliograph", "serve", "network.py", "--node", node, "--broker", broker]
         environment = os.environ | {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT / 'studies'}:{ROOT}"}
         self.log = open(folder / f"{node}.log", "ab")  # noqa: SIM115
@@ -241,7 +229,7 @@ def test_of_three_processes_one_is_killed_and_catches_up(kind: str, tmp_path: Pa
     from heliograph_studies.live.server import Server
     from tests.serving.broker_servers import at, published, sent
 
-    steps, results = 300, dict[tuple[str, str], dict[int, dict[str, list]]]()
+    steps, results = 500, dict[tuple[str, str], dict[int, dict[str, list]]]()
     record = simulated(steps, 5)
 
     async def taken(message: "nats.aio.msg.Msg") -> None:
@@ -277,7 +265,7 @@ def test_of_three_processes_one_is_killed_and_catches_up(kind: str, tmp_path: Pa
         k = 0
         while min(map(newest, "abc")) < 3:
             await measure(k)
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.25)
             k += 1
         # One is killed; the others go on.
         processes["b"].kill()

@@ -84,7 +84,7 @@ def by_jit(function, *arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "over"), list(zip(FILTERS, (hg.simulation.over_runs, by_jit, hg.simulation.over_runs), strict=True))
+    ("name", "over"), list(zip(FILTERS, (by_jit, hg.simulation.over_runs, hg.simulation.over_runs), strict=True))
 )
 def test_gradients_are_finite_differences(name, over):
     """By either engine."""

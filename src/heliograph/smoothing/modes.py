@@ -13,7 +13,6 @@ from heliograph.codegen.engine import compiled
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float
 from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag
@@ -23,7 +22,7 @@ DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
 EXCESS = 1.05  # times the expected NIS: less does little harm
 
 
-@in_float64
+@compiled
 def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
     """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:

@@ -27,6 +27,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     yield from running(tmp_path_factory.mktemp("server"))
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch):
+    """Connections that are tried again after a twentieth of a second at first, and not a quarter."""
+    for module in ("mqtt", "nats", "transport"):
+        monkeypatch.setattr(f"heliograph.serving.brokers.{module}.FIRST", 0.05)
+
+
 def test_the_url_is_said_without_what_is_secret():
     result = address("mqtts://me:p%40ss@example.org/site/one", {})
     assert (result.kind, result.host, result.port, result.topic) == ("mqtt", "example.org", 8883, "site/one")
@@ -111,7 +118,7 @@ def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
 
 
 @pytest.mark.real("NATS")
-def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, caplog):
+def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, caplog, impatient):
     async def work() -> None:
         where = address(f"nats://me:s3cret@127.0.0.1:{server.nats}/site", {})
         reader = await made(where)
@@ -198,7 +205,7 @@ def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here: apt-get install openssl")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho leaves sockets to the collector
-def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog):
+def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog, impatient):
     make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
     certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
     what = ["-subj", "/CN=here", "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate]

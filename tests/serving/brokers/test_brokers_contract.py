@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 
@@ -29,10 +30,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 class OverNats:
-    """A service through JetStream, and the sensor and the reader on the other side."""
+    """A service through JetStream, and the sensor and the reader on the other side; its subjects are topics of MQTT."""
 
     def __init__(self, server: Server):
-        self.where, self.url = at(server, "nats", "contract"), f"nats://127.0.0.1:{server.nats}"
+        self.where, self.url = at(server, "nats", "stream"), f"nats://127.0.0.1:{server.nats}"
 
     def transport(self) -> Transport:
         return Nats(self.where)
@@ -45,7 +46,7 @@ class OverNats:
 
     async def published(self) -> list[bytes]:
         client = await nats.connect(self.url)
-        reader = await client.jetstream().subscribe("contract.out.*.*", ordered_consumer=True)
+        reader = await client.jetstream().subscribe("stream.out.*.*", ordered_consumer=True)
         results = []
         with contextlib.suppress(nats.errors.TimeoutError):
             while True:
@@ -58,11 +59,11 @@ class OverMqtt:
     """The same through MQTT."""
 
     def __init__(self, server: Server):
-        self.where, self.received = at(server, "mqtt", "contract"), list[bytes]()
+        self.where, self.received = at(server, "mqtt", "session"), list[bytes]()
         self.reader = Client(CallbackAPIVersion.VERSION2)
         self.reader.on_message = lambda client, data, message: self.received.append(message.payload)
         self.reader.connect(self.where.host, self.where.port)
-        self.reader.subscribe("contract/out/#", 1)
+        self.reader.subscribe("session/out/#", 1)
         self.reader.loop_start()
 
     def transport(self) -> Transport:
@@ -75,17 +76,27 @@ class OverMqtt:
         return list(self.received)
 
 
+@pytest.fixture(scope="module")
+def checks(server: Server) -> Iterator[dict[str, Future[bool]]]:
+    """Checks of both kinds, of which each waits for silence: side by side."""
+    over_mqtt = OverMqtt(server)
+    with ThreadPoolExecutor(2) as pool:
+        yield {
+            kind: pool.submit(check_transport, broker)
+            for kind, broker in (("nats", OverNats(server)), ("mqtt", over_mqtt))
+        }
+    over_mqtt.reader.disconnect()
+    over_mqtt.reader.loop_stop()
+
+
 @pytest.mark.real("NATS")
-def test_jetstream_keeps_the_contract_and_sends_again_in_order(server: Server):
-    assert check_transport(OverNats(server))
+def test_jetstream_keeps_the_contract_and_sends_again_in_order(checks: dict[str, Future[bool]]):
+    assert checks["nats"].result()
 
 
 @pytest.mark.real("MQTT")
-def test_mqtt_keeps_the_contract(server: Server):
-    broker = OverMqtt(server)
-    check_transport(broker)  # this server sends what is new first
-    broker.reader.disconnect()
-    broker.reader.loop_stop()
+def test_mqtt_keeps_the_contract(checks: dict[str, Future[bool]]):
+    checks["mqtt"].result()  # this server sends what is new first
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
@@ -21,7 +22,7 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractThreshold
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
@@ -61,7 +62,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Always true: silence is a measurement."""
         return True
 
-    @in_float64
+    @compiled
     def init(self) -> StochasticBelief:
         """The prior."""
         start = at(self.plant, 0)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
@@ -70,7 +71,7 @@ class ScheduledFilter(AbstractSizedFilter):
         self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
         self.received = g.direct.shape[2]
 
-    @in_float64
+    @compiled
     def init(self) -> ScheduleState:
         """Return the schedule's initial state."""
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
@@ -186,7 +187,7 @@ class MixtureFilter(AbstractSizedFilter):
         """True: it is a mixture over atoms."""
         return True
 
-    @in_float64
+    @compiled
     def init(self) -> MixtureBelief:
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)

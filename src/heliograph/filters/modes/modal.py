@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.gaussian.precise import (
@@ -111,7 +112,7 @@ class ModalFilter(AbstractModalFilter):
     Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
     """
 
-    @in_float64
+    @compiled
     def init(self) -> ModalBelief:
         """Return the prior, independent of the mode."""
         law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
@@ -62,7 +63,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     channel: Channel
     late: bool = eqx.field(static=True)
 
-    @in_float64
+    @compiled
     def init(self) -> ModeObservedBelief:
         """Return the belief before any data."""
         belief = prior_belief(at(self.plant, 0))

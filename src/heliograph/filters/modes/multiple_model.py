@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
@@ -185,7 +186,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
 
-    @in_float64
+    @compiled
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
         start, modes = at(self.plant, 0), len(self.initial)

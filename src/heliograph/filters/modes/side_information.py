@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
 from heliograph.filters.gaussian.precise import initial_size
@@ -105,7 +106,7 @@ class SideInformationFilter(AbstractSizedFilter):
     initial: Float[Array, " M"]
     flagged: bool = eqx.field(static=True)
 
-    @in_float64
+    @compiled
     def init(self) -> SideInformationBelief:
         """Return the prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.codegen.engine import compiled
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.modes.modal import (
     AbstractModalFilter,
@@ -31,7 +32,6 @@ from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import eigh
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -62,7 +62,7 @@ class UncertainModalFilter(AbstractModalFilter):
     Source: the filter of Costa (1994) with Young's inequality for the uncertain part of the chain.
     """
 
-    @in_float64
+    @compiled
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known."""
         law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)

@@ -150,7 +150,17 @@ def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
 
     Nodes of one strongly connected component share them.
     """
-    from scipy.sparse.csgraph import breadth_first_order, connected_components
+    # Paths of twice as many edges with each product.
+    count = len(graph.nodes)
+    if count <= FEW:
+        receiver, column = np.nonzero(graph.present)
+        paths = np.zeros((count, count), dtype=bool)
+        paths[receiver, graph.senders[receiver, column]] = True
+        for _ in range(count.bit_length()):
+            paths = paths @ paths
+        known: dict[bytes, np.ndarray] = {}
+        return [known.setdefault(row.tobytes(), np.flatnonzero(row)) for row in paths]
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # .2 s
 
     reach = graph.reach()
     count, label = connected_components(reach, connection="strong")

@@ -24,7 +24,16 @@ from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import WHOLE, Batch, Part, Retry, TakenOverError, still_needed, topic_of
+from heliograph.serving.brokers.transport import (
+    FIRST,
+    WHOLE,
+    Batch,
+    Part,
+    Retry,
+    TakenOverError,
+    still_needed,
+    topic_of,
+)
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -155,6 +164,7 @@ class Nats:
                 tls=self.address.tls(),
                 allow_reconnect=False,
                 connect_timeout=5,
+                reconnect_time_wait=FIRST,  # type: ignore[arg-type]  # between attempts at a server that is away
             )
             # The stream of outputs that are published exactly once.
             server = self._client.jetstream(timeout=ANSWER)
