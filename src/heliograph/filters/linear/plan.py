@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.codegen.engine import computed
+from heliograph.codegen.engine import SHORT, computed
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -124,7 +124,7 @@ def plan(
     `projection` (n, N) maps the filter's mean to the plant's states.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
-    return _plan(*arguments) if is_traced(arguments) else computed(_plan, _plan_by_xla, arguments)
+    return _plan(*arguments) if is_traced(arguments) else computed(_plan, _plan_by_xla, arguments, SHORT)
 
 
 def _plan(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
