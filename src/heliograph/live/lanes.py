@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.codegen.engine import compiled
 from heliograph.live.later import Sweeper
 from heliograph.live.row_step import RowStep
 from heliograph.live.snapshot import Identity, network_identity
@@ -15,7 +16,6 @@ from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen, computed
+from heliograph.codegen.engine import chosen, compiled, computed
 from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
@@ -245,7 +245,7 @@ class AllFilters(Module):
         return centre.step(state, parts, means, u, k)
 
 
-@quickly_compiled
+@compiled
 def begun(filters: AllFilters) -> PyTree:
     """Return states before the first step, by one program: otherwise each operation is a program of its own."""
     return jax.tree.map(jnp.asarray, filters.init())
