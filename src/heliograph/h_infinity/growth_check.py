@@ -195,8 +195,8 @@ class _Tools:
 
     def __init__(self, function: Function, width: float):
         self.width, self.function = width, function
-        self.jacobian = compiled(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
-        self.values = compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
+        self.jacobian = _by_part(compiled(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x))))))
+        self.values = _by_part(compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x)))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian at each point; infinite where it is no number."""
@@ -221,6 +221,18 @@ class _Tools:
         """Size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
+
+
+def _by_part(function: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    """Apply a compiled function of points to as many at a time as a climb tries, so that it is one program."""
+
+    def call(points: np.ndarray) -> np.ndarray:
+        size = CLIMBERS * TRIALS
+        padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
+        values = [np.asarray(function(padded[start : start + size])) for start in range(0, len(padded), size)]
+        return np.concatenate(values)[: len(points)]
+
+    return call
 
 
 def _finding(
