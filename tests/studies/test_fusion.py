@@ -17,7 +17,7 @@ def test_the_summary_has_every_rule_in_its_order(tmp_path, fits):
     # One number of steps, and as many nodes as the tree has leaves: what is compiled for one serves the others.
     setting = fusion.Setting(
         steps=60, crossed_nodes=12, many_steps=60, measured_steps=60, runs=64, tree_nodes=30, degree=5, machine_runs=4,
-        machine_nodes=2, intervals=(1, 2), thresholds=(0.3,), traffic_steps=8,
+        machine_nodes=2, intervals=(2, 4), thresholds=(0.3,), traffic_steps=8,
     )  # fmt: skip
     fusion.run(setting, tmp_path)
     fits(tmp_path / "fusion" / "report.html")

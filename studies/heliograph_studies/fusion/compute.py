@@ -287,20 +287,19 @@ def traffic(setting: Setting) -> dict[str, list[dict[str, float]]]:
     plant, parts = described("three_rooms")
     # Reports every d-th step, or where the estimate has moved by a threshold.
     every = {f"every {d}": hg.fusion.ReportLink(every=d) for d in setting.intervals}
-    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
-        name: hg.Fusion(LOCAL, hg.fusion.AllReports(), uplink=link) for name, link in every.items()
-    }
+    fused = {name: hg.Fusion(LOCAL, hg.fusion.AllReports(), uplink=link) for name, link in every.items()}
     for informed in (True, False):
         for level in setting.thresholds:
             sends = hg.fusion.EventSending(level, informed)
             name = f"{'informed' if informed else 'uninformed'} {level}"
             fused[name] = hg.Fusion(LOCAL, hg.fusion.AllReports(), quantizer=sends)
-    net = hg.Network(plant, network(plant, parts).nodes, fused)
-    sums = hg.monte_carlo(net, setting.traffic_steps, setting.runs // 4, setting.seed, hg.Statistics())["fused"]
-    # Averages over the second half of the steps.
+    # One after another on the same draws: centres that differ in numbers alone are one program.
+    nodes, judged = network(plant, parts).nodes, (setting.traffic_steps, setting.runs // 4, setting.seed)
     result: dict[str, list[dict[str, float]]] = {"every": [], "informed": [], "uninformed": []}
+    # Averages over the second half of the steps.
     late = slice(setting.traffic_steps // 2, None)
-    for name, item in sums.items():
+    for name, fusion in fused.items():
+        item = hg.monte_carlo(hg.Network(plant, nodes, {"centre": fusion}), *judged, hg.Statistics())["fused"]["centre"]
         kind, number = name.split()
         sent = 1 / int(number) if item.uplink is None else float(item.uplink.symbols[late].mean())
         claimed = float(np.trace(item.claimed(), axis1=1, axis2=2)[late].mean())

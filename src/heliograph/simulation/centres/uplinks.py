@@ -195,7 +195,7 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
         quantizers=stack(quantizers) if quantizers else None,
         links=_known([described(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
-        every=np.array([link.every for link in mine]),
+        every=np.array([link.every for link in mine], float),  # numbers of a program: other intervals share it
         received=received,
         n=n,
     )
