@@ -143,11 +143,11 @@ BOX, STEPS = ([0.4, 0.5], "box"), ([0.4, 0.5], "each")
         (hg.perfect(2), hg.SendOnDelta(BOX[0])),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(BOX[0])),
         (hg.perfect(2), hg.SendOnDelta(STEPS[0], region="each")),
-        (ALONE, hg.SendOnDelta(STEPS[0], region="each", heartbeat=15)),
+        (ALONE, hg.SendOnDelta(STEPS[0], region="each", heartbeat=10)),
         (ALONE, hg.SendOnDelta(STEPS[0], region="each", losses="numbered")),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnPredictionError(BOX[0])),
         (hg.perfect(2), hg.SendOnDelta(0.5, region="ball")),
-        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", heartbeat=10)),
+        (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", heartbeat=6)),
         (hg.erasure(hg.perfect(2), 0.8), hg.SendOnDelta(0.5, region="ball", reference="acknowledged")),
     ],
     ids=[
