@@ -44,7 +44,7 @@ def posterior(plant: Scalar, link: Link, delta: float, z: np.ndarray) -> tuple[n
     reach = 5.5 * np.sqrt(max(p, q / (1 - a * a)))
     x = np.arange(-int(reach / h), int(reach / h) + 1) * h
     move = _normal(x[:, None] - a * x[None], q) * h
-    noise = _normal(x[:, None] - x[None], r)  # N(r; x, R), (x, r)
+    noise = _normal(x[:, None] - x[None], r) * h  # N(r; x, R), (x, r), of a cell
     quiet = ndtr((x[None] + delta - x[:, None]) / np.sqrt(r)) - ndtr((x[None] - delta - x[:, None]) / np.sqrt(r))
     modes, begun, last, total, lost = len(link.loss), False, 0.0, 0.0, False
     atom, f = link.initial[:, None] * _normal(x, p) * h, np.zeros((modes, len(x), len(x)))
@@ -58,7 +58,7 @@ def posterior(plant: Scalar, link: Link, delta: float, z: np.ndarray) -> tuple[n
         free = 1 - _share(x, last, delta, h) if begun else np.ones(len(x))  # of each cell of r, what an event leaves
         if np.isnan(value):
             beyond = atom[:, :, None] * free
-            gone = loss[:, :, None] * (noise * h) * (_beyond(f, cells) + beyond if lost else beyond)
+            gone = loss[:, :, None] * noise * (_beyond(f, cells) + beyond if lost else beyond)
             stay = ndtr((last + delta - x) / np.sqrt(r)) - ndtr((last - delta - x) / np.sqrt(r)) if begun else 0.0
             atom, f, lost = atom * stay, f * quiet + gone if lost else gone, True
         else:
@@ -86,7 +86,8 @@ def _share(x: np.ndarray, centre: float, delta: float, h: float) -> np.ndarray:
 
 def _beyond(f: np.ndarray, cells: int) -> np.ndarray:
     """Sums over r' of f(x, r') with |r - r'| > delta, for each r."""
-    edges = np.concatenate([np.zeros((*f.shape[:-1], 1)), np.cumsum(f, axis=-1)], axis=-1)
     n = f.shape[-1]
+    edges = np.zeros((*f.shape[:-1], n + 1))
+    np.cumsum(f, axis=-1, out=edges[..., 1:])
     low, high = np.clip(np.arange(n) - cells, 0, n), np.clip(np.arange(n) + cells + 1, 0, n)
-    return edges[..., -1:] - edges[..., high] + edges[..., low]
+    return edges[..., -1:] - np.take(edges, high, axis=-1) + np.take(edges, low, axis=-1)

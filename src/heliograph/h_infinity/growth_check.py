@@ -1,7 +1,7 @@
 """Checks of a function's growth over a box: its largest slope, a pair that breaks it, or a proof by intervals."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -195,8 +195,8 @@ class _Tools:
 
     def __init__(self, function: Function, width: float):
         self.width, self.function = width, function
-        self.jacobian = compiled(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
-        self.values = compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
+        self.jacobian = _by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
+        self.values = _by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian at each point; infinite where it is no number."""
@@ -221,6 +221,19 @@ class _Tools:
         """Size |f(0)|, infinite where it is no number."""
         size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
         return size if np.isfinite(size) else np.inf
+
+
+def _by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
+    """Compile a function of points for as many at a time as a climb tries, so that it is one program."""
+    compute = compiled(function)
+
+    def call(points: np.ndarray) -> np.ndarray:
+        size = CLIMBERS * TRIALS
+        padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
+        values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]
+        return np.concatenate(values)[: len(points)]
+
+    return call
 
 
 def _finding(
