@@ -9,7 +9,7 @@ from heliograph.live.lanes import Lanes
 from heliograph.simulation.side_by_side import Alike
 from tests.live import worlds
 
-OWN = 1  # program, of the test: the filters begin by native code; there were 136
+SEEN = 1  # program, of the test: the filters begin by native code; there were 136
 
 
 def test_a_timeline_begins_with_no_program_of_xla(caplog):
@@ -20,7 +20,7 @@ def test_a_timeline_begins_with_no_program_of_xla(caplog):
         hg.Timeline(network, 4.0, capacity=30)
         jax.jit(lambda x: x + 1)(0.5)  # which is seen
     compiled = [line for line in map(logging.LogRecord.getMessage, caplog.records) if "XLA compilation of" in line]
-    assert len(compiled) == OWN, compiled
+    assert len(compiled) == SEEN, compiled
 
 
 def test_a_step_is_traced_once_for_its_outputs_its_code_and_its_text(monkeypatch):
