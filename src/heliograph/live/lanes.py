@@ -80,7 +80,7 @@ def _moved(
         n = len(x)
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:
-            u = jnp.ones(len(plant.inputs)).at[dt].set(interval)
+            u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
             a = jax.jacfwd(plant.transition)(state, u)
             state, matrix, spread = (
                 plant.transition(state, u) + plant.noise_mean(),
