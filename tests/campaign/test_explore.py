@@ -58,6 +58,7 @@ def data(html):
     return json.loads(result)
 
 
+@pytest.mark.slow
 def test_the_page_holds_the_scores(finished, scores, tmp_path, capsys):
     assert cli.main(["explore", str(finished), "--out", str(tmp_path / "new")]) == 0
     path = tmp_path / "new" / "explore.html"
@@ -89,6 +90,7 @@ def test_nothing_is_fetched_and_every_text_is_escaped(hostile):
     assert "http" not in local and not re.search(r"<script[^>]+src|@import|url\(", local)
 
 
+@pytest.mark.slow
 def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
     assert hostile.count('<section class="static">') == 2
     assert "@media print { #explore { display: none; } }" in hostile and '<section id="explore" hidden>' in hostile

@@ -37,6 +37,7 @@ def fail_chunk(monkeypatch, times: int) -> list[tuple[int, int]]:
     return tried
 
 
+@pytest.mark.slow
 def test_a_chunk_is_tried_again(tmp_path, expected, monkeypatch):
     tried = fail_chunk(monkeypatch, 2)
     result = run_campaign(write(tmp_path), tmp_path / "out", workers=0)

@@ -47,6 +47,7 @@ def test_the_numbers_are_found_with_their_intervals(folder):
     assert content["rows"] == 450 and content["converged"] and not content["stopped"]
 
 
+@pytest.mark.slow
 def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "moved")
     out = tmp_path / "estimates.csv"

@@ -231,6 +231,7 @@ def test_special_numbers_are_what_jax_makes_of_them(function):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_random_draws_are_those_of_jax():
     def draw(number):
         key = jax.random.fold_in(jax.random.key(3), number)

@@ -18,6 +18,7 @@ def test_a_cell_is_no_formula_and_can_be_read_again(text):
     assert not cell.startswith(FORMULA) and from_cell(cell) == visible(text)
 
 
+@pytest.mark.slow
 @given(st.text())
 def test_what_is_visible_moves_no_cursor(text):
     assert all(c.isprintable() for c in visible(text))

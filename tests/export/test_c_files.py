@@ -173,6 +173,7 @@ int main(void)
 """
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_single_precision_keeps_variances_positive(tmp_path):
     """P_0 / R = 1e8 over a million steps; the end is the steady covariance, to the rounding of a few products."""

@@ -114,6 +114,7 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
         np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_what_is_smoothed_is_turned_too(east_and_west):
     """Sweeps never wrap: the cut is at no angle; what they tell is between -pi and pi. To rounding of 30 steps."""
     results = [record.smoothed for record in east_and_west]

@@ -212,6 +212,7 @@ def test_a_covariance_each_is_not_enough():
         hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
 
 
+@pytest.mark.slow
 def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
     """Cubature filters behind gains that hardly vary are the linear ones: weights, reports and claims agree.
 

@@ -85,6 +85,7 @@ def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, g
         assert here.amplitude[0] >= 1e-3 and here.number[0] == there.number[0]
 
 
+@pytest.mark.slow
 def test_an_amplitude_off_by_rounding_does_not_lose_the_receiver():
     """Where the receiver was compiled otherwise: it takes no decision by its amplitude, so rounding stays rounding."""
     rng = np.random.default_rng(0)

@@ -95,6 +95,7 @@ def test_every_second_step_sends(record):
         assert np.isnan(values[:, ::2]).all() and np.isfinite(values[:, 1::2]).all()
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees(record):
     """Mean squares within three standard errors of each run's own claim; the quantized one's is above."""
     for name, estimate in record.estimates["fused"].items():

@@ -31,6 +31,7 @@ def test_any_feasible_point_is_a_dead_end():
     assert np.isfinite(design.gains[: design.failed_step]).all() and np.isnan(design.gains[design.failed_step :]).all()
 
 
+@pytest.mark.slow
 def test_a_level_too_low_says_where_it_fails_and_what_would_work():
     design = hg.h_infinity.recursive_design(node(0), 0.02)
     assert not design.feasible
@@ -41,6 +42,7 @@ def test_a_level_too_low_says_where_it_fails_and_what_would_work():
         hg.filters.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
 
 
+@pytest.mark.slow
 def test_the_initial_weight_alone_sets_the_smallest_level_of_the_paper():
     """(19), 10 I < gamma^2 15 I: sqrt(10/15); the solver's margin is 1e-6 of the level squared."""
     design = hg.h_infinity.recursive_design(node(2), 0.5, START)

@@ -167,6 +167,7 @@ def test_a_finding_is_about_one_function():
     assert not certify_level(system, *parts, output_growth=[of_f]).certified  # .5 is more than h is given
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_symmetric_are_refused():
     system = hg.h_infinity.growth_system(
         1, np.zeros((2, 1)), [[0.0]], np.eye(2), hg.hop(1.0, 0.1), 0.0, transition=0.1 * np.eye(2)

@@ -66,6 +66,7 @@ def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
     assert result.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_learned_covers_the_truth(result):
     assert result.converged
     for row in result.rows():
@@ -179,6 +180,7 @@ def test_recordings_that_cannot_be_learned_from(build, data, message):
         hg.fit(build, data, INPUTS)
 
 
+@pytest.mark.slow
 def test_a_value_of_a_noise_with_two_values_is_learned():
     """Its powers, 0 to 2, are moments of a noise that depends on what is searched for."""
 

@@ -3,6 +3,7 @@
 import logging
 
 import jax
+import pytest
 
 import heliograph as hg
 from heliograph.live.lanes import Lanes
@@ -12,6 +13,7 @@ from tests.live import worlds
 SEEN = 1  # program, of the test: the filters begin by native code; there were 136
 
 
+@pytest.mark.slow
 def test_a_timeline_begins_with_no_program_of_xla(caplog):
     """What is copied to a device outside of a program must not be a program for each of its shapes."""
     network = worlds.remembering()

@@ -62,6 +62,7 @@ def test_a_sender_that_misses_its_heartbeat_is_dead_not_constant():
     assert lossy.senders()["a"].missed == 5 and lossy.senders()["a"].dead  # .2^5 = 3e-4
 
 
+@pytest.mark.slow
 def test_what_is_known_of_a_sender_is_saved():
     line = hg.Timeline(network(), window=1)
     line.push("a", 0, 0.0, [0.2])
@@ -79,6 +80,7 @@ def chain(channel):
     return result
 
 
+@pytest.mark.slow
 def test_a_stream_says_which_steps_are_silent_and_whether_its_sender_is_dead():
     stream = hg.Stream(network(hg.perfect()).nodes["a"].filters["f"])
     for value in (0.2, np.nan, 1.0, np.nan, np.nan, np.nan, np.nan):

@@ -110,6 +110,7 @@ def test_a_state_may_exchange_its_numbers(engine, monkeypatch):
     assert [stream.push(0.0).mean[0] for _ in range(3)] == [142.0, 231.0, 342.0]
 
 
+@pytest.mark.slow
 def test_a_state_goes_on_under_the_other_engine(monkeypatch):
     item, (z, u) = hg.cubature_filter(PLANT, SENSOR, RELAY), rows()
     for first, second in (("native", "xla"), ("xla", "native")):
@@ -150,6 +151,7 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
             stream.push([np.inf, 1.0], [0.0])
 
 
+@pytest.mark.slow
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
     """One of a plant with an incomplete beta function; by native code alone it is refused in one line."""
     plant = hg.Plant(

@@ -77,6 +77,7 @@ def test_claims_are_exact(result: dict[str, dict[str, hg.Statistics]], name: str
     assert np.max(np.abs(s.actual() - s.claimed()) / error) < Z_LIMIT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "sent"), [("plain", 1.0), ("trajectory", 0.0)])
 def test_the_error_is_that_of_the_power_that_is_sent(
     result: dict[str, dict[str, hg.Statistics]], name: str, sent: float

@@ -33,6 +33,7 @@ def test_gains_are_those_of_the_tuning_within_the_budget(relays, design):
     assert design.certificate.words == "best of the one start; no bound is known"
 
 
+@pytest.mark.slow
 def test_the_network_it_gives_sends_and_errs_as_designed(design):
     sent = hg.power(design.network)
     for name in ("north", "south"):

@@ -62,6 +62,7 @@ def test_the_best_receiver_behind_given_relays(local):
     assert relative(long.gains.covariance[-2:], behind) < 1e-9
 
 
+@pytest.mark.slow
 def test_without_relays_it_is_the_linear_filter():
     full = example()
     direct = full.slots[1]["relay_1"]["sensor"]
@@ -119,6 +120,7 @@ def test_relays_that_receive_only_each_other_learn_nothing():
         np.testing.assert_allclose(design.covariance[name][-1], still.covariance["receiver"][-1], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_periodic_design_is_no_schedule_from_the_start(local):
     """Its covariances are those after long, not those of the first period."""
     net = example()
@@ -132,6 +134,7 @@ def test_a_periodic_design_is_no_schedule_from_the_start(local):
     assert {s.horizon for s in relay_schedules(net, given_design(net, repeated)).values()} == {4}
 
 
+@pytest.mark.slow
 def test_what_has_no_steady_state_is_refused(local):
     net = example()
     unstable = LinearPlant(1.1 * np.eye(3), np.eye(3), np.zeros(3), np.eye(3))

@@ -53,6 +53,7 @@ def test_it_is_the_best_linear_function_of_everything_received():
     assert relative(result, best_from_all_measurements(p, gains)) < 1e-9  # of the batch solve
 
 
+@pytest.mark.slow
 def test_it_is_at_least_as_good_as_the_greedy_receiver():
     for net, horizon in ((example(), 100), (unusual(), 9)):
         design = local_error_design(net, horizon)
@@ -68,6 +69,7 @@ def test_bad_gains_are_refused():
         receiver_behind_relays(example(), {"relay_1": np.zeros((4, 3, 1)), "relay_2": np.zeros((4, 3, 2))})
 
 
+@pytest.mark.slow
 def test_it_runs_as_a_filter():
     schedule = receiver_behind_relays(example(), local_error_design(example(), 3).gains)
     filter_ = ScheduledFilter(schedule)

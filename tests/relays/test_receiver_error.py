@@ -107,6 +107,7 @@ def test_limits_that_can_not_be_met_are_refused(local):
         receiver_error_design(example(), HORIZON, weights=-np.ones(HORIZON))
 
 
+@pytest.mark.slow
 def test_one_step_ahead_greedy_is_best_for_the_receiver(greedy):
     """With all weight on the last step, that step's receiver gain is the greedy one for the moments it meets."""
     net, weights = unusual(), np.eye(STEPS)[-1]

@@ -158,6 +158,7 @@ def test_each_node_reads_its_sensor_at_topics_of_others_and_a_node_without_one_c
     agree(exchanged(lost, fleets, from_topic), lost, chain(link=LOSSY))
 
 
+@pytest.mark.slow
 def test_a_node_whose_measurement_is_missing_sends_when_the_next_step_has_begun():
     nodes = {name: Service(item, InMemoryStore()) for name, item in services().items()}
     sent = []

@@ -94,6 +94,7 @@ def test_shapes_and_order(record):
     assert all(line.startswith("fused/static") for line in record.failures())
 
 
+@pytest.mark.slow
 def test_chunks_change_no_bit(record):
     other = hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
     pairs = zip(leaves(record), leaves(other), strict=True)
@@ -213,6 +214,7 @@ def test_saturation_is_reported_and_nothing_is_claimed_there(record):
     assert 1 < record.uplinks["escape"].symbols_per_value() < 5
 
 
+@pytest.mark.slow
 def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
     some = [hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk) for chunk in (64, 256)]
     for name in ("outer", "covariance", "nees", "count"):

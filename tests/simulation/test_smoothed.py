@@ -45,6 +45,7 @@ def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
                 np.testing.assert_allclose(known.covariance[run], alone.covariance, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     result = record.smoothed.estimates
     parts = [result[node]["linear"] for node in GAPS.names]

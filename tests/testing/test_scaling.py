@@ -105,6 +105,7 @@ def test_a_nonlinear_network_with_inputs_and_states_known_exactly():
     assert check_scaling(network, np.full((5, 1), 0.1)) <= 1
 
 
+@pytest.mark.slow
 def test_a_filter_whose_answers_depend_on_units_is_found():
     network = linear_network(hg.perfect(2))
 

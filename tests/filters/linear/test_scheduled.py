@@ -54,6 +54,7 @@ def single(s, keep):
     return s._replace(channel=hg.random_affine.Series([s.channel, hg.random_affine.known(row)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_missing_component_is_a_channel_that_is_off(missing):
     """Every monomial with the component in it goes; what is left is the filter of the other component alone."""

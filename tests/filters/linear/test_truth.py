@@ -82,6 +82,7 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
     assert result.ratio[-1, 0] == pytest.approx(known[lag], abs=0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "channel", [bursts(), hg.amplify_and_forward(HOPS), hg.model.with_direct_link(bursts(), HOPS[0])]
 )

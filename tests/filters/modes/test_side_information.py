@@ -69,6 +69,7 @@ def test_a_state_that_is_known_stays_known():
     np.testing.assert_allclose(result[:, 0], 42.1271 * (-1.1468) ** np.arange(1, 9), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [1e-8, 1e-14, 1e-20])
 def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
     """Of x received in noise far below its own: the variance is the noise's, where a difference would be rounding."""

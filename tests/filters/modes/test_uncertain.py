@@ -39,6 +39,7 @@ def test_a_radius_of_zero_is_the_exact_filter():
     assert hg.linear_filter(PLANT, SENSOR, rough(0.0)).claim == "exact"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_it_dominates_the_truth_of_chains_that_wander_within_the_radius(seed):
     """Three modes with atoms, transitions drawn anew at each step, half of them at the ends."""

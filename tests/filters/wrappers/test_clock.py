@@ -92,6 +92,7 @@ def test_against_a_true_clock_and_in_motion_both_are_found(moving):
     assert nees(moving["guarded"], slice(0, 2)) == pytest.approx(1.0, rel=3 / np.sqrt(RUNS))
 
 
+@pytest.mark.slow
 def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     """As known exactly; the published .54 and 21 are of one simulation, whose squares have a deviation of 1/7."""
     errors, _ = moving["ignored"]

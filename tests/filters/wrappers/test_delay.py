@@ -229,6 +229,7 @@ def test_relays_that_are_late_by_chance(simulated):
     assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
 
 
+@pytest.mark.slow
 def test_a_record_as_events(simulated):
     """Each value under the step that it is of; a value that is received twice comes under one number twice."""
     network, record = simulated

@@ -55,12 +55,14 @@ def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, we
     assert errors.claim == "exact"
 
 
+@pytest.mark.slow
 def test_an_intersection_claims_at_least_its_error_for_every_pattern(lossy):
     for seed, name in product(range(3), ("equal", "trace")):
         errors = hg.simulation.mesh_errors(lossy, name, arrivals(lossy, name, 30, seed))
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
+@pytest.mark.slow
 def test_best_weights_are_no_worse_than_any_other_of_one_step(lossy):
     arrived = arrivals(lossy, "best", 2, 1)
     result = {name: hg.simulation.mesh_errors(lossy, name, arrived).mean_trace() for name in RULES}

@@ -90,6 +90,7 @@ def test_a_run_is_that_by_hand_and_sends_the_less_the_larger_alpha(record):
     assert shares[0] > 0.9 > shares[1] > 1.5 * shares[2]
 
 
+@pytest.mark.slow
 def test_where_any_move_is_sent_nothing_changes(record):
     for node in NODES:
         for part in ("mean", "covariance"):

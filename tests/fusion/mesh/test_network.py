@@ -40,6 +40,7 @@ def test_every_node_has_an_estimate_with_its_claim(lossy, record):
     assert arrived == pytest.approx(0.7, abs=4 * np.sqrt(0.21 / (4 * RUNS * STEPS)))
 
 
+@pytest.mark.slow
 def test_exact_claims_are_the_errors_and_upper_ones_not_below(record):
     # 640 runs of 12 correlated steps: the mean of a NEES of 2 states has a deviation of about .015
     for name, (least, most) in {"best": (0.95, 1.05), "diffusion": (0.95, 1.05), "trace": (0.5, 1.05)}.items():
@@ -83,6 +84,7 @@ def test_statistics_have_each_node(statistics):
     assert statistics["b"]["trace"].runs == 960 and np.isfinite(statistics["b"]["trace"].rmse()[0])
 
 
+@pytest.mark.slow
 def test_bursts_leave_upper_claims_upper_and_exact_ones_exact(statistics):
     for node in "abcd":
         assert statistics[node]["trace"].nees_per_dimension()[0] < 1.05

@@ -86,6 +86,7 @@ def test_single_precision_tells_the_same_story():
     assert (double.claim, single.claim) == ("exact", "nominal")  # nobody counts the digits that it loses
 
 
+@pytest.mark.slow
 def test_single_precision_error_of_a_filter_on_the_same_data():
     """Rounding to 24 bits, amplified by a few steps: below 1e-5 of the estimates' size."""
     item = network().nodes["a"].filters["f"]

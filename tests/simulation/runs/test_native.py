@@ -244,6 +244,7 @@ def test_keys_of_another_hash_are_simulated_by_xla():
         native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories(), 8)
 
 
+@pytest.mark.slow
 def test_of_a_program_that_is_refused_the_reason_stays_alone():
     """A program of 200,000 operations is 100 MB, which a traceback would hold."""
     plant = hg.Plant(lambda x, u: x / (1 + jnp.linalg.svd(jnp.outer(x, x))[1]), 0.1 * np.eye(2), np.ones(2), np.eye(2))
