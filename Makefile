@@ -5,9 +5,8 @@ PYTHON ?= python3
 PYTHONS ?= python3.11 python3.13
 
 BIN := .venv/bin
+# Sources are compiled when they are first imported: a third of those that are installed.
 INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-compile
-# What was installed, on all cores: pip would use one.
-COMPILE := -W ignore -m compileall -qq -j 0 .venv/lib
 # A file to a process, in the order of tests/conftest.py.
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
@@ -65,26 +64,22 @@ $(CREATED):
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi,live]'
 	@$(BIN)/python -c 'import pytest' 2>/dev/null || \
 	  { printf '#!/bin/sh\necho "pytest: run make test, which installs what the tests need" >&2\nexit 2\n' >$(BIN)/pytest && chmod +x $(BIN)/pytest; }
-	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 
 .venv/.test: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph and its tools into .venv (the first time: a minute or two) ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
-	@$(BIN)/python $(COMPILE) || true
 	@touch .venv/.demo $@
 
 # The extra `motor` by its package: with all the others, which are there by now, it takes twenty times as long.
 .venv/.check: .venv/.test
 	@echo "Installing the simulator of a motor drive into .venv ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt gym-electric-motor
-	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 
 .venv/.docs: .venv/.test
 	@echo "Installing what builds the documentation into .venv ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,docs]'
-	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 
 # The newest of everything on the oldest and on a newer Python. jax, numpy, scipy and zarr have left 3.11 behind,
