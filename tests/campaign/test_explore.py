@@ -96,6 +96,7 @@ def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
     assert "@media print { #explore { display: none; } }" in hostile and '<section id="explore" hidden>' in hostile
 
 
+@pytest.mark.slow
 def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
     monkeypatch.setattr(explore, "ROWS", 4)
     html = explore.explore_page(campaign, scores)
@@ -112,6 +113,7 @@ def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
     assert data(explore.explore_page(alike, item))[0]["x"] == "setting"
 
 
+@pytest.mark.slow
 def test_single_states_add_up_to_the_scores(tmp_path):
     """Of two states at three of six steps: the squares of their RMSEs sum to that of all, and steps average to it."""
     network = NETWORK.replace('[[0.9]], 0.1, [0.0], 0.3, states=["x"]', "[[0.9, 0], [0.1, 0.8]], 0.1, [0.0, 0.0], 0.3")

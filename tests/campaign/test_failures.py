@@ -75,6 +75,7 @@ def test_a_chunk_that_fails_is_reported_and_runs_alone(tmp_path, expected, monke
     assert contents(out) == expected
 
 
+@pytest.mark.slow
 def test_a_setting_that_cannot_be_built(tmp_path, expected, trouble):
     campaign, out = write(tmp_path), tmp_path / "out"
     trouble.write_text("raise")

@@ -8,6 +8,7 @@ from heliograph.campaign.work import Errors
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, chunk_files, contents, write
 
 
+@pytest.mark.slow
 def test_the_store_is_labelled(finished):
     results = open_results(finished)
     assert dict(results.sizes) == {"setting": 6, "run": 100, "time": 4, "node": 1, "filter": 1, "state": 1}

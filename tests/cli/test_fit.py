@@ -56,6 +56,7 @@ def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tm
     assert code == 0 and out.is_file()
 
 
+@pytest.mark.slow
 def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
     """By the difference of the log-likelihoods of both filters over the last 150 rows, computed another way."""
     summary = json.loads((folder / "out" / "summary.json").read_text())

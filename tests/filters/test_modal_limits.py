@@ -17,6 +17,7 @@ def test_fading_in_bursts():
     np.testing.assert_allclose(result, [0.323796, 0.283304, 0.248939, 0.238689], atol=6e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
 def test_two_sensors_with_shared_fading_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))

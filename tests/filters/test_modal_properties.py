@@ -53,6 +53,7 @@ def test_equal_rows_are_no_memory(seed, plant, sensor, maps, rows, law):
     np.testing.assert_allclose(result, variances(plant, sensor, forgets, 30), rtol=1e-11)
 
 
+@pytest.mark.slow
 @of_problems(6)
 def test_the_order_of_modes_changes_nothing(seed, plant, sensor, maps, rows, law):
     order = np.random.default_rng(seed + 100).permutation(3)

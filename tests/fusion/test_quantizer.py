@@ -267,6 +267,7 @@ class _Optimist(hg.fusion.UniformQuantizer):
         return state, sent._replace(error=sent.error / 2)
 
 
+@pytest.mark.slow
 def test_the_check_finds_a_bound_that_does_not_hold():
     with pytest.raises(AssertionError, match="error: expected a bound, exceeded by"):
         check_quantizer(_Optimist(8, 3.0))

@@ -142,6 +142,7 @@ def test_without_feedthrough_a_gain_of_zero_is_optimal():
     np.testing.assert_allclose(hg.h_infinity.horizon_design(system).level, zero, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_no_division_where_a_link_always_delivers():
     for beta in ((1.0, 1.0, 1.0), (1.0, 0.75, 0.7), (0.8, 1.0, 1.0)):
         design = hg.h_infinity.horizon_design(node(0, beta=beta))

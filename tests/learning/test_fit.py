@@ -74,6 +74,7 @@ def test_what_is_learned_covers_the_truth(result):
         assert abs(row.estimate - TRUTH[row.name]) < 4 * row.standard_error
 
 
+@pytest.mark.slow
 def test_the_network_runs(result, recording):
     record = hg.run(result.network, {"node": recording.measurements["node"][0]}, INPUTS)
     assert record.measurements["node"].shape == (STEPS, 2)

@@ -3,8 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
 PROGRAM = """
 import multiprocessing, warnings
 import heliograph as hg
@@ -29,7 +27,6 @@ REFUSED = (
 )
 
 
-@pytest.mark.slow
 def test_a_fork_is_said_before_it_hangs():
     completed = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=120)
     assert completed.stdout.splitlines() == ["None", REFUSED], completed.stderr

@@ -55,6 +55,7 @@ def test_what_relays_that_filter_do_not_take_is_named(relays):
             hg.design(relays, **given)
 
 
+@pytest.mark.slow
 def test_a_network_of_relays_that_filter_is_refused(design):
     with pytest.raises(ValueError, match="network: expected a RelayNetwork alone"):
         hg.design(design.network, budget=1)

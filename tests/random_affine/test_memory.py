@@ -118,6 +118,7 @@ def test_the_contract_holds(name):
     check_random_affine(COMBINED[name][0])
 
 
+@pytest.mark.slow
 def test_a_map_that_forgets_has_no_state_and_draws_what_it_samples():
     channel = hg.dropout(
         hg.random_affine.Stack([HOP, hg.random_affine.Series([HOP, hg.hop(hg.Rayleigh(1.0), 0.2)])]), 0.7

@@ -116,6 +116,7 @@ def test_one_step_ahead_greedy_is_best_for_the_receiver(greedy):
     assert recompute(net, tuned.gains).correlation["receiver"][-1] < 1e-6  # the damping of the gains is 1e-9
 
 
+@pytest.mark.slow
 def test_the_gradient_vanishes_in_every_gain(greedy, free):
     """By central differences of a recursion that made no gains, against the slope at the start of the search."""
     net = unusual()

@@ -22,7 +22,6 @@ def network(channel, rules):
     return hg.Network(PLANT, nodes, {name: hg.Fusion("f", rule) for name, rule in rules.items()})
 
 
-@pytest.mark.slow
 def test_it_is_that_of_all_that_arrives_by_the_prediction_from_the_fused_estimate():
     """e' S^-1 e, S = M (H P- H' + R) M' + the spread of the gain on E[y y'] + noise; to rounding."""
     link = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), NOISE)

@@ -103,6 +103,7 @@ def test_chunks_change_no_bit(record):
         assert np.array_equal(uplink.saturated, other.uplinks[name].saturated)
 
 
+@pytest.mark.slow
 def test_fewer_runs_are_the_first_of_more_runs(record):
     few = hg.monte_carlo(NETWORK, HORIZON, 5, 11, inputs=INPUTS)
     assert np.array_equal(few.truth, record.truth[:5])
@@ -231,6 +232,7 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
         np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
     result = statistics["fused"]["over time"]

@@ -55,6 +55,7 @@ def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     assert np.all(np.trace(fused.covariance, axis1=2, axis2=3)[:, :-1] < 0.5)  # of about 1 without measurements
 
 
+@pytest.mark.slow
 def test_saving_says_what_has_to_be_saved_apart(record, tmp_path):
     with pytest.warns(UserWarning, match="without `smoothed`, which is saved apart"):
         record.save(tmp_path / "all.nc")

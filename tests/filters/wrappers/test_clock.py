@@ -106,6 +106,7 @@ def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trap", "filters"), [("resting", ""), ("moving", ", alone")], ids=["at rest", "no true clock"]
 )

@@ -96,6 +96,7 @@ def claimed(a, c, r, q, weights, gains, noise):
 numbers = st.floats(-1.0, 1.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(numbers, min_size=4, max_size=4), st.lists(numbers, min_size=2, max_size=2), st.integers(0, 2**32 - 1))
 def test_unknown_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):

@@ -112,6 +112,7 @@ def available(arrived):
     return known
 
 
+@pytest.mark.slow
 def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy):
     steps = 5
     arrived = arrivals(lossy, "trace", steps, 2)
@@ -137,6 +138,7 @@ def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy)
         assert bound[i] == pytest.approx(least, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_no_rule_beats_the_bound(lossy):
     arrived = arrivals(lossy, "best", 12, 5)
     bound = hg.simulation.best_possible(lossy, "best", arrived)
@@ -312,6 +314,7 @@ def test_losses_in_bursts_have_no_mean_here():
         hg.simulation.mean_mesh_errors(net, "m", 3)
 
 
+@pytest.mark.slow
 def test_noise_that_is_known_by_a_bound_makes_upper_claims():
     """`Contaminated.at_most` gives the largest covariance: what is computed with it is no error, but bounds it."""
     plant, noise = hg.LinearPlant([[0.9]], 0.2, [0.0], 1.0), hg.Contaminated.at_most(0.1, 0.05, 4.0)

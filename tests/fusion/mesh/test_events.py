@@ -98,6 +98,7 @@ def test_where_any_move_is_sent_nothing_changes(record):
             np.testing.assert_allclose(*both, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALPHAS)
 def test_no_error_is_above_its_claim(record, name):
     for node in NODES:

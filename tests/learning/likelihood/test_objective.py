@@ -61,7 +61,6 @@ def test_native_code_computes_what_the_compiler_of_jax_does(both):
                 np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
 
 
-@pytest.mark.slow
 def test_scores_are_the_derivatives_of_the_likelihood(both):
     objective, data = both
     for x in points(objective):

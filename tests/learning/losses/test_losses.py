@@ -112,6 +112,7 @@ def test_intervals_of_counts_are_wilsons(hits, of):
     np.testing.assert_allclose(wilson(hits, of), (hits / of, *expected), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_running_rate_is_a_recursion(learned, bursts):
     law, rate, said = learned.laws["running"], None, []
     base, weight, step = (s.estimate for s in law.shares().values())

@@ -132,6 +132,7 @@ def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     assert mean <= p + q <= 1.05 * mean
 
 
+@pytest.mark.slow
 def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     result = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)

@@ -224,6 +224,7 @@ class Largest(AbstractReducer):
         return carry, collected.max(axis=1)
 
 
+@pytest.mark.slow
 def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
     network, results = shadowed(), {}
     for engine in ("native", "xla"):
