@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import scipy
 
 from heliograph.numerics.check import array, fail, items, scalar, shown, table
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
@@ -60,12 +59,6 @@ class Graph(NamedTuple):
             parts.append(Graph(self.nodes, self.senders[rows, :width], self.present[rows, :width]))
             least = width
         return parts
-
-    def reach(self) -> "scipy.sparse.csr_array":
-        """Matrix (node, node) with a one where a node receives another, itself included."""
-        receiver, column = np.nonzero(self.present)
-        ones = np.ones(len(receiver), dtype=np.int32)
-        return scipy.sparse.csr_array((ones, (receiver, self.senders[receiver, column])), shape=(len(self.nodes),) * 2)
 
 
 def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
@@ -150,23 +143,15 @@ def upstream(graph: Graph) -> list[Int[np.ndarray, " senders"]]:
 
     Nodes of one strongly connected component share them.
     """
-    # Paths of twice as many edges with each product.
     count = len(graph.nodes)
-    if count <= FEW:
-        receiver, column = np.nonzero(graph.present)
-        paths = np.zeros((count, count), dtype=bool)
-        paths[receiver, graph.senders[receiver, column]] = True
-        for _ in range(count.bit_length()):
-            paths = paths @ paths
-        known: dict[bytes, np.ndarray] = {}
-        return [known.setdefault(row.tobytes(), np.flatnonzero(row)) for row in paths]
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # .2 s
-
-    reach = graph.reach()
-    count, label = connected_components(reach, connection="strong")
-    # Components that a component receives from, over all paths: a row of the reach is one of receivers.
-    receivers, senders = reach.nonzero()
-    between = scipy.sparse.csr_array((np.ones(len(senders)), (label[receivers], label[senders])), shape=(count, count))
-    behind = [breadth_first_order(between, c, return_predecessors=False) for c in range(count)]
-    places = [np.flatnonzero(np.isin(label, seen)) for seen in behind]
-    return [places[c] for c in label]
+    rows = [row[there].tolist() for row, there in zip(graph.senders, graph.present, strict=True)]
+    # Sets of nodes as bits: each with those of its senders, forth and back until nothing is added.
+    behind, before = [1 << i for i in range(count)], list[int]()
+    while behind != before:
+        before = list(behind)
+        for i in (*range(count), *reversed(range(count))):
+            for sender in rows[i]:
+                behind[i] |= behind[sender]
+    bits = {known: np.frombuffer(known.to_bytes(count // 8 + 1, "little"), np.uint8) for known in set(behind)}
+    places = {known: np.flatnonzero(np.unpackbits(row, bitorder="little")) for known, row in bits.items()}
+    return [places[known] for known in behind]
