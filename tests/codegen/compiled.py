@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import llvmlite.binding as llvm
 import numpy as np
 
+from heliograph.codegen.llvm.lanes import types
 from heliograph.codegen.vectors.elementary import functions
 
 WIDTH = 8
@@ -16,7 +17,7 @@ class Compiled:
 
     def __init__(self, names: Iterable[str]):
         names = list(names)
-        self.engine = engine_of(functions(WIDTH, names) + "".join(_loop(name) for name in names))
+        self.engine = engine_of(functions(names, WIDTH) + "".join(_loop(name) for name in names))
 
     def __call__(self, name: str, *arguments: np.ndarray) -> np.ndarray:
         """The function's results."""
@@ -30,13 +31,13 @@ class Compiled:
 
 
 def engine_of(text: str) -> llvm.ExecutionEngine:
-    """Compiled code of a module's text."""
+    """Compiled code of the text of functions."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=1
     )
-    module = llvm.parse_assembly(text)
+    module = llvm.parse_assembly(types(WIDTH) + text)
     module.verify()
     engine = llvm.create_mcjit_compiler(module, target)
     engine.finalize_object()
@@ -44,7 +45,7 @@ def engine_of(text: str) -> llvm.ExecutionEngine:
 
 
 def _loop(name: str) -> str:
-    vector = f"<{WIDTH} x double>"
+    vector = "%double"
     arguments = f"{vector} %a" + (f", {vector} %b" if name in ("atan2", "pow") else "")
     return f"""
 define void @loop_{name}(ptr %x, ptr %y, ptr %z, i64 %count) {{

@@ -7,6 +7,7 @@ import pytest
 
 from heliograph.codegen.accumulated import Accumulated
 from heliograph.codegen.lowering import scalars
+from heliograph.codegen.machine import Machine
 from heliograph.codegen.program import Summed, folded, lower, row_length
 from heliograph.codegen.rules.arrived import arrived
 
@@ -56,6 +57,26 @@ def test_sums_go_on(begun):
     for start in range(0, 320, 32):
         begun.add(np.arange(start, start + 32), sums)
     np.testing.assert_allclose(folded(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
+
+
+def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
+    """Each run adds to the same place of a row, also beyond the last batch: code in haste has narrower vectors."""
+
+    def uneven(start, number):
+        return (jnp.exp(jnp.sin(start + 0.1 * number)),)
+
+    with jax.enable_x64(True):
+        program = lower(uneven, np.float64(0), np.uint32(0))
+    code = Accumulated(program, Summed((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
+    results = []
+    for width in (1, 2, 4, 8):
+        code._machine, sums = Machine(code.program.code.blocks, 0, width), code.zeros()
+        for start, count in ((0, 37), (37, 120), (160, 53)):
+            code.add(np.arange(start, start + count), sums)
+        results.append(sums[0])
+    assert results[0][BATCHES:].any()
+    for result in results[1:]:
+        np.testing.assert_array_equal(result, results[0])
 
 
 def test_rows_are_folded_once():

@@ -108,4 +108,4 @@ def test_code_lets_go_of_the_program_that_it_was_made_of():
     code = compile(rotated, STARTS[0])
     code(STARTS)
     assert nodes() == before
-    assert "define void @run" in code.code.blocks.text
+    assert "define void @run" in code.code.blocks.text(8)

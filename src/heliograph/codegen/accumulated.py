@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.codegen.compiled import addresses, aligned, best_width
+from heliograph.codegen.compiled import addresses, aligned
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import written
-from heliograph.codegen.machine import Tiers, features
+from heliograph.codegen.machine import WIDEST, Tiers, features, narrow
 from heliograph.codegen.program import Program, Summed, row_length
 
 
@@ -20,12 +20,12 @@ class Accumulated:
 
     def __init__(self, program: Program, summed: Summed):
         differs = [n == summed.number for n in range(len(program.inputs))]
-        self.width, self.summed = best_width(), summed
+        self.summed = summed
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
-        self.code = written(program, differs, self.width, features()[2], summed=summed)
+        self.code = written(program, differs, WIDEST, features()[2], summed=summed)
         self.common = self.code.common
-        self.blocks = Tiers(self.code.blocks)
-        self.once = None if self.code.once is None else Tiers(self.code.once)
+        self.blocks = Tiers(self.code.blocks, (narrow(), WIDEST))
+        self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
     def begin(self, arguments: Sequence[Any], runs: int) -> "Begun":
         """Compute everything that the runs share, from the arguments other than the number of the run.
@@ -52,17 +52,17 @@ class Begun:
                 kind = np.dtype(DTYPES[buffer.type])
                 held = self.memory[offset : offset + buffer.size * kind.itemsize]
                 self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
-        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // program.width))
+        self._machine = None if all(program.common) else program.blocks.machine(-(-runs // WIDEST))
 
     def zeros(self) -> list[np.ndarray]:
         """Return sums over no runs, of each summed result: (..., batch), rows as `folded` takes them."""
-        length = row_length(self.program.width, self.program.summed.batches)
+        length = row_length(WIDEST, self.program.summed.batches)
         return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
 
     def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
         """Add runs to the sums; return the other results, (run, ...), None for those that are shared or summed.
 
-        Runs are computed in blocks of consecutive ones, each several times the code's width.
+        Runs are computed in blocks of consecutive ones, each several times as many as a vector has.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
         # Outputs of the code: the sums themselves, or an array with a row for each run.
@@ -80,7 +80,7 @@ class Begun:
         if len(numbers) and self._machine is not None:
             scratch = aligned(self.program.code.scratch)
             pointers = self._pointers(numbers, results)
-            blocks = -(-len(numbers) // self.program.width)
+            blocks = -(-len(numbers) // self._machine.width)
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return given
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
-from heliograph.codegen.machine import ALWAYS, LONG, Function, Machine, Tiers, features
+from heliograph.codegen.machine import ALWAYS, LONG, WIDEST, Function, Machine, Tiers, features, narrow
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
@@ -22,21 +22,21 @@ SHARES = 4  # parts of the work for each core, so that one that is held up holds
 
 
 class Compiled:
-    """Code for blocks of `width` runs.
+    """Code for blocks of runs, one for each number of a vector; of `width` runs, or of as many as suit the processor.
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
     it. Results have the same bits whatever the width and the number of cores.
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
-        self.width = width or best_width()
+        self.width = width or WIDEST
         self.differs = list(differs)
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes = [b.shape for b in program.inputs]
         self.tree = program.tree
         self.code: Code = written(program, self.differs, self.width, features()[2])
-        self.blocks = Tiers(self.code.blocks)
-        self.once = None if self.code.once is None else Tiers(self.code.once)
+        self.blocks = Tiers(self.code.blocks, (width or narrow(), self.width))
+        self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
         self._first: list[np.ndarray] = []
         self._addresses, self._tables = list[int](), addresses(self.code.tables)
 
@@ -71,8 +71,8 @@ class Compiled:
         return jax.tree.unflatten(self.tree, outputs)
 
     def _run(self, pointers: np.ndarray, runs: int, cores: int | None) -> None:
-        blocks = -(-runs // self.width)
-        run = self.blocks.machine(blocks).run
+        machine = self.blocks.machine(-(-runs // self.width))
+        run, blocks = machine.run, -(-runs // machine.width)
         if cores == 1 or blocks * self.code.blocks.work < LITTLE:
             self._blocks(run, pointers, 0, blocks, runs)
             return
@@ -104,7 +104,7 @@ class Alone:
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
         self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
         level = int(self.code.operations <= LONG)
-        self.machine, self.tree, self._in_place = Machine(self.code.blocks.text, level), program.tree, in_place
+        self.machine, self.tree, self._in_place = Machine(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
 
@@ -136,11 +136,6 @@ def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence
     """Compile a function of one run's arguments, of the shapes of these, for many runs."""
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
     return Compiled(lower(function, *examples), differs)
-
-
-def best_width() -> int:
-    """Return the number of runs in a block: one vector of the widest processors, two of others; more only spill."""
-    return 8
 
 
 def addresses(arrays: Sequence[np.ndarray]) -> list[int]:

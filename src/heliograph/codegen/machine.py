@@ -45,14 +45,15 @@ class Machine:
     """Code of one text; its function `run` may be called as long as this object exists.
 
     LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
-    `level` is that of the generation: 0 in haste, 1 with registers assigned with care. Results have the same bits.
+    `level` is that of the generation: 0 in haste, 1 with registers assigned with care; `width` is the count of runs of
+    a vector. Results have the same bits whatever both are.
     """
 
-    def __init__(self, text: str, level: int):
-        self.level = level
+    def __init__(self, source: Source, level: int, width: int):
+        self.level, self.width = level, width
         cpu, flags, *_ = features()
         machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
-        module = llvm.parse_assembly(text)
+        module = llvm.parse_assembly(source.text(width))
         module.verify()
         code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
         module.close()  # three times the memory of its code
@@ -68,23 +69,37 @@ def often(operations: int) -> float:
     return OFTEN * min(max(operations, SMALL), LARGE) / LARGE
 
 
+WIDEST = 8  # runs of a vector: one register of the widest processors, two of others; more only spill
+
+
+@cache
+def narrow() -> int:
+    """Return the runs of one register where it has fewer than WIDEST: in haste as fast as two, and sooner generated.
+
+    LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
+    """
+    wide = llvm.get_host_cpu_features().get("avx512f", False)
+    return WIDEST if wide else WIDEST // 2
+
+
 class Tiers:
     """Code of one text, generated again with care when its executions have cost as much as that.
 
     A program that is executed `often` is generated with care at once, if its first call says so. Both have the same
-    results, bit for bit, so that nothing but time depends on earlier calls.
+    results, bit for bit, so that nothing but time depends on earlier calls. `widths` are the runs of a vector in haste
+    and with care.
     """
 
-    def __init__(self, source: Source):
-        self._source, self._executions, self._lock = source, 0.0, Lock()
+    def __init__(self, source: Source, widths: tuple[int, int]):
+        self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: Machine | None = None
 
     def machine(self, blocks: float) -> Machine:
-        """Return code that is about to be executed for so many blocks of runs."""
+        """Return code that is about to be executed for so many blocks of the most runs."""
         with self._lock:
             self._executions += blocks * self._source.work / max(self._source.operations, 1)
             careful = self._executions >= often(self._source.operations)
             level = int(careful and not jax.config.values["jax_disable_most_optimizations"])
             if self._machine is None or self._machine.level < level:
-                self._machine = Machine(self._source.text, level)
+                self._machine = Machine(self._source, level, self._widths[level])
             return self._machine

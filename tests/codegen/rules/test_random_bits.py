@@ -134,12 +134,12 @@ def test_keys_of_another_hash_are_refused() -> None:
 
 
 def test_the_compiled_hash() -> None:
-    words, wide = f"<{WIDTH} x i32>", f"<{WIDTH} x i64>"
+    words, wide = "%i32", "%i64"
     loads = "".join(
         f"  %p{i} = getelementptr {words}, ptr %in, i64 {i}\n  %w{i} = load {words}, ptr %p{i}, align 4\n"
         for i in range(4)
     )
-    text = hash_function(WIDTH) + (
+    text = hash_function() + (
         f"define void @all(ptr %in, ptr %out) {{\n{loads}"
         f"  %r = call {wide} @hg_threefry({', '.join(f'{words} %w{i}' for i in range(4))})\n"
         f"  store {wide} %r, ptr %out, align 8\n  ret void\n}}\n"

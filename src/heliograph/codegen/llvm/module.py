@@ -3,12 +3,14 @@
 import math
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
+from heliograph.codegen.llvm.lanes import WIDTH, gather, lane_numbers, types
 from heliograph.codegen.llvm.operations import BITS
 from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
@@ -38,16 +40,18 @@ class Source(NamedTuple):
     """Text of a function with its count of operations, and how many it executes for a block of runs, loop by loop.
 
     The text waits compressed, to a tenth: it is needed again only if the program turns out to be executed often.
+    `helpers` write the functions that it calls, for a count of lanes.
     """
 
     compressed: bytes
+    helpers: Sequence[Callable[[int], str]]
     operations: int
     work: int
 
-    @property
-    def text(self) -> str:
-        """Return the text."""
-        return zlib.decompress(self.compressed).decode()
+    def text(self, width: int) -> str:
+        """Return the text for vectors of so many runs."""
+        body = zlib.decompress(self.compressed).decode()
+        return "\n".join([types(width), *(helper(width) for helper in self.helpers), body])
 
 
 class Output(NamedTuple):
@@ -63,7 +67,7 @@ class Output(NamedTuple):
 
 
 class Code(NamedTuple):
-    """Text of the two functions, and their arguments.
+    """Text of the two functions, of which the second is for vectors of one number, and their arguments.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
     `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` are those in the
@@ -125,8 +129,8 @@ def written(
 ) -> Code:
     """Write a program; `differing` says of each input whether it differs between runs.
 
-    `alone`: one run, whose arrays are used in place; results of the numbers `last` may overwrite arguments. `summed`:
-    outputs that are summed over runs. The program is let go of.
+    `width`: the most runs of a vector. `alone`: one run, whose arrays are used in place; results of the numbers `last`
+    may overwrite arguments. `summed`: outputs that are summed over runs. The program is let go of.
 
     Raises:
         Unsupported: an operation that has no text, or a program that is too long.
@@ -165,21 +169,20 @@ def written(
     # The function of blocks computes what differs, and reads the rest from slots.
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
-    blocks = Writer(width, mine, products, spread, slots)
+    blocks = Writer(alone, mine, products, spread, slots)
     blocks.turning = turning
-    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
-    text = _with_functions(text, blocks)
+    text, movers = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, width, summed)
     # The other function fills these slots, once for all runs.
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
     once = None
     if roots:
-        writer = Writer(1, needed(roots), products, set(), slots)
+        writer = Writer(True, needed(roots), products, set(), slots)
         writer.turning = turning
-        once = _source(_with_functions(_once(writer, program, pointers, in_shared), writer), writer.mine)
+        once = _source(_once(writer, program, pointers, in_shared), writer, [])
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    source, results = _source(text, mine), [Output(b.type, b.shape) for b in outputs]
+    source, results = _source(text, blocks, movers), [Output(b.type, b.shape) for b in outputs]
     divisions = counts["div"] + counts["sqrt"]
     program.graph.top.let_go()
     return Code(source, once, arrays, results, common, places, slots.size, scratch + LINE, operations, divisions)
@@ -198,12 +201,18 @@ def _read(items: Iterable[Any]) -> set[Buffer]:
     return {node.value[0].owner[0] for node in nodes if node.op == "load"}
 
 
-def _source(text: str, items: Iterable[Any]) -> Source:
+def _source(text: str, writer: Writer, movers: Sequence[Callable[[int], str]]) -> Source:
     """Count the operations of a text and the executed ones; a loop of unknown length counts as one turn."""
-    counts = Counter([x.block for x in items if isinstance(x, Node)])
+    counts = Counter([x.block for x in writer.mine if isinstance(x, Node)])
     turns = {block: turns_of(block) for block in counts}
     work = sum(count * turns[block] for block, count in counts.items())
-    return Source(zlib.compress(text.encode(), 1), counts.total(), work)
+    helpers: list[Callable[[int], str]] = [*movers, *(partial(gather, *kind) for kind in sorted(writer.gathered))]
+    called = writer.called - {"threefry"}
+    if called:
+        helpers.append(partial(functions, called))
+    if "threefry" in writer.called:
+        text = f"{hash_function()}\n{text}"
+    return Source(zlib.compress(text.encode(), 1), helpers, counts.total(), work)
 
 
 def _places(
@@ -230,9 +239,13 @@ def _blocks(
     in_scratch: dict[Buffer, int],
     in_shared: dict[Buffer, int],
     alone: bool,
+    width: int,
     summed: Summed | None,
-) -> str:
-    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back."""
+) -> tuple[str, list[Callable[[int], str]]]:
+    """Write the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
+
+    Return it with what writes the functions that move inputs and outputs.
+    """
     names = _pointers(writer, pointers, in_shared)
     for buffer, offset in in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
@@ -241,8 +254,8 @@ def _blocks(
     writer.line("br label %block")
     writer.start("block")
     writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
-    writer.line(f"%first = mul i64 %number, {writer.width}")
-    movers = set()
+    writer.line(f"%first = mul i64 %number, {WIDTH}")
+    movers = set[tuple[int, bool]]()
 
     def move(kind: str, buffer: Buffer) -> None:
         bits = BITS[buffer.type]
@@ -255,9 +268,11 @@ def _blocks(
     given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
     for buffer in taken:
         move("take", buffer)
+    helpers: list[Callable[[int], str]] = []
     if summed is not None:
+        helpers.append(lane_numbers)
         added = [b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in writer.spread]
-        _add(writer, summed, names, program.inputs[summed.number], added)
+        _add(writer, summed, names, program.inputs[summed.number], added, width)
     writer.block(program.graph.top)
     for buffer in given:
         if buffer not in writer.sums:
@@ -270,23 +285,25 @@ def _blocks(
     writer.line("br i1 %more, label %block, label %exit")
     writer.start("exit")
     body = "\n".join(writer.lines)
-    texts = [mover(bits, writer.width, inwards) for bits, inwards in sorted(movers)]
-    return "\n".join([*texts, f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"])
+    helpers += [partial(mover, *kind) for kind in sorted(movers)]
+    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n", helpers
 
 
-def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
-    """Make the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
-    width = writer.width
-    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
+def _add(
+    writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer], width: int
+) -> None:
+    """Make the stores to some outputs add to sums over runs.
+
+    A run's place in a row is that of a block of the most runs, which begins with the batch of its first run: so sums
+    have the same bits whatever the number of runs in a vector.
+    """
+    begin = writer.add(f"and i64 %first, {-width}")
+    address = writer.add(f"getelementptr i32, ptr {names[number]}, i64 {begin}")
     run = writer.add(f"load i32, ptr {address}, align 4")
     batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
-    count = writer.add("sub i64 %runs, %first")
-    first = writer.add(f"insertelement <{width} x i64> poison, i64 {count}, i64 0")
-    every = writer.add(
-        f"shufflevector <{width} x i64> {first}, <{width} x i64> poison, <{width} x i32> zeroinitializer"
-    )
-    numbers = ", ".join(f"i64 {lane}" for lane in range(width))
-    writer.counted = writer.add(f"icmp ult <{width} x i64> <{numbers}>, {every}")
+    batch = writer.add(f"add i64 {batch}, {writer.add(f'sub i64 %first, {begin}')}")
+    count = writer.everywhere(writer.add("sub i64 %runs, %first"), "i64")
+    writer.counted = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {count}")
     for buffer in outputs:
         writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {batch}")
         writer.sums[buffer] = row_length(width, summed.batches)
@@ -313,14 +330,3 @@ def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, in
     for buffer, start in in_shared.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr {writer.slots.base}, i64 {start}")
     return names
-
-
-def _with_functions(text: str, writer: Writer) -> str:
-    """Add the functions that the text calls."""
-    called = writer.called - {"threefry"}
-    parts = [text]
-    if called:
-        parts.insert(0, functions(writer.width, called))
-    if "threefry" in writer.called:
-        parts.insert(0, hash_function(writer.width))
-    return "\n".join(parts)

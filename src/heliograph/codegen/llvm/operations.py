@@ -1,12 +1,12 @@
 """Scalar operations as text of LLVM IR, on vectors <W x T> of as many runs.
 
-The compiler decides nothing: a product and a sum are one fused operation only where the text says so, so that the bits
-of a result depend neither on the width nor on the level of optimisation.
+A text names the type <W x T> by `%T` and leaves W open: `lanes.types` defines the names, and with them W. The compiler
+decides nothing: a product and a sum are one fused operation only where the text says so, so that the bits of a result
+depend neither on the width nor on the level of optimisation.
 """
 
 import struct
 from collections.abc import Callable
-from functools import cache
 
 from heliograph.codegen.nodes import Node, Type, Unsupported
 from heliograph.codegen.vectors.elementary import FUNCTIONS, SCALAR
@@ -22,10 +22,9 @@ CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` befo
 Emit = Callable[[str], str]  # the text of an operation -> the name of its result
 
 
-@cache
-def vector(type: Type, width: int) -> str:
-    """Return the type <W x T>."""
-    return f"<{width} x {LLVM[type]}>"
+def vector(type: Type) -> str:
+    """Return the name of the type <W x T>."""
+    return f"%{LLVM[type]}"
 
 
 def literal(value: float | int | bool, type: Type) -> str:
@@ -42,11 +41,11 @@ def splat(value: float | int | bool, type: Type) -> str:
     return f"splat ({LLVM[type]} {literal(value, type)})"
 
 
-def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
+def operation(node: Node, names: list[str], emit: Emit) -> str:
     """Emit the operation of a node on its arguments' names; return the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
-    operand_type = vector(source, width)
-    op, result_type = node.op, vector(node.type, width)
+    operand_type = vector(source)
+    op, result_type = node.op, vector(node.type)
     if source == "f64" and op in FLOAT:
         return emit(f"{FLOAT[op]} {operand_type} {names[0]}, {names[1]}")
     if op == "select":
@@ -55,19 +54,16 @@ def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
     if op in ORDER:
         return emit(f"{_comparison(op, source)} {operand_type} {names[0]}, {names[1]}")
     if op == "convert":
-        return _converted(source, node.type, names[0], width, emit)
+        return _converted(source, node.type, names[0], emit)
     if op == "bitcast":
         return emit(f"bitcast {operand_type} {names[0]} to {result_type}")
     if op == "not":
         return emit(f"xor {operand_type} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
     # Functions of `vector_math`, then arithmetic by type.
     if op in CALLED:
-        typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
+        typed = ", ".join(f"{vector(a.type)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result_type} @hg_{op}({typed})")
-    kind = f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
-    if source == "f64":
-        return _of_doubles(op, names, operand_type, kind, width, emit)
-    return _of_integers(node, names, operand_type, kind, emit)
+    return (_of_doubles if source == "f64" else _of_integers)(node, names, operand_type, emit)
 
 
 def _comparison(op: str, type: Type) -> str:
@@ -78,29 +74,29 @@ def _comparison(op: str, type: Type) -> str:
     return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
 
 
-def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emit: Emit) -> str:
-    first = f"{text} {names[0]}"
+def _of_doubles(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    op, first = node.op, f"{text} {names[0]}"
     if op == "neg":
         return emit(f"fneg {first}")
     if op in UNARY:
-        return emit(f"call {text} @llvm.{UNARY[op]}.{kind}({first})")
+        return emit(f"call {text} @llvm.{UNARY[op]}({first})")
     # maximum and minimum of IEEE 754-2019: NaN if either is.
     if op in ("max", "min"):
-        return emit(f"call {text} @llvm.{op}imum.{kind}({first}, {text} {names[1]})")
+        return emit(f"call {text} @llvm.{op}imum({first}, {text} {names[1]})")
     if op == "is_finite":
-        size = emit(f"call {text} @llvm.fabs.{kind}({first})")
+        size = emit(f"call {text} @llvm.fabs({first})")
         return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
     # sign x = x for zeros and NaN.
     if op == "sign":
-        signed = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
+        signed = emit(f"call {text} @llvm.copysign({text} {splat(1.0, 'f64')}, {first})")
         other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
-        return emit(f"select <{width} x i1> {other}, {text} {signed}, {first}")
+        return emit(f"select {vector('bool')} {other}, {text} {signed}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
     raise Unsupported(op)
 
 
-def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit) -> str:
+def _of_integers(node: Node, names: list[str], text: str, emit: Emit) -> str:
     op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op in INTEGER:
         return emit(f"{INTEGER[op]} {first}, {names[1]}")
@@ -108,9 +104,9 @@ def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit)
         return emit(f"sub {text} zeroinitializer, {names[0]}")
     signed = type[0] == "i"
     if op in ("max", "min"):
-        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}.{kind}({first}, {text} {names[1]})")
+        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}({first}, {text} {names[1]})")
     if op == "abs" and signed:
-        return emit(f"call {text} @llvm.abs.{kind}({first}, i1 false)")
+        return emit(f"call {text} @llvm.abs({first}, i1 false)")
     # Division by zero and shifts by all bits are undefined in LLVM: only constants are accepted.
     if op in ("div", "rem") and node.args[1].op == "constant" and node.args[1].value > 0:
         return emit(f"{'s' if signed else 'u'}{op} {first}, {names[1]}")
@@ -121,28 +117,27 @@ def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit)
     raise Unsupported(f"{op} of {type}")
 
 
-def _converted(source: Type, target: Type, name: str, width: int, emit: Emit) -> str:
-    operand_type, result_type = vector(source, width), vector(target, width)
+def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:
+    operand_type, result_type = vector(source), vector(target)
     if source == target or LLVM[source] == LLVM[target]:
         return name
     if target == "f64":
         return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {operand_type} {name} to {result_type}")
     if source == "f64":
         how = "fptosi" if target[0] == "i" else "fptoui"
-        suffix = f"v{width}{LLVM[target]}.v{width}f64"
-        return emit(f"call {result_type} @llvm.{how}.sat.{suffix}({operand_type} {name})")
+        return emit(f"call {result_type} @llvm.{how}.sat({operand_type} {name})")
     if BITS[target] < BITS[source]:
         return emit(f"trunc {operand_type} {name} to {result_type}")
     return emit(f"{'sext' if source[0] == 'i' else 'zext'} {operand_type} {name} to {result_type}")
 
 
-def fused(node: Node, product: Node, names: list[str], width: int, emit: Emit) -> str:
+def fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
     """Emit a b + c, c - a b or a b - c, rounded once, from the names of a, b, c."""
-    doubles = vector("f64", width)
+    doubles = vector("f64")
     a, b, c = names
     if node.op == "sub":
         if node.args[1] is product:
             a = emit(f"fneg {doubles} {a}")
         else:
             c = emit(f"fneg {doubles} {c}")
-    return emit(f"call {doubles} @llvm.fma.v{width}f64({doubles} {a}, {doubles} {b}, {doubles} {c})")
+    return emit(f"call {doubles} @llvm.fma({doubles} {a}, {doubles} {b}, {doubles} {c})")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from heliograph.codegen.llvm.lanes import gather_name
 from heliograph.codegen.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
 from heliograph.codegen.nodes import Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from heliograph.codegen.program import fusable
@@ -41,10 +42,10 @@ class Slots:
 
     def store(self, writer: "Writer", node: Node, name: str) -> None:
         """Store a number, which the other function uses."""
-        kind = vector(node.type, 1)
+        kind = vector(node.type)
         address = self._address(writer, node)
         if node.type == "bool":
-            name, kind = writer.add(f"zext {kind} {name} to <1 x i8>"), "<1 x i8>"
+            name, kind = writer.add(f"zext {kind} {name} to %i8"), "%i8"
         writer.line(f"store {kind} {name}, ptr {address}, align 1")
 
     def _address(self, writer: "Writer", node: Node) -> str:
@@ -65,17 +66,18 @@ def turns_of(block: Block) -> int:
 class Writer:
     """Writer of a program's operations in the set `mine`: those that differ between runs, or those that do not.
 
-    `bases` has each buffer's address, `spread` the buffers with a number for each lane. `shared` locates numbers that
-    all runs share and that the other function computes.
+    `single`: vectors are of one number. `bases` has each buffer's address, `spread` the buffers with a number for each
+    lane. `shared` locates numbers that all runs share and that the other function computes.
     """
 
-    def __init__(self, width: int, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
-        self.width, self.mine, self.products, self.spread, self.slots = width, mine, products, spread, slots
+    def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: Slots):
+        self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
         self.label = "entry"
         self.count = 0
         self.called: set[str] = set()
+        self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has its own
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
         self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn
@@ -114,7 +116,7 @@ class Writer:
 
     def _keep(self, node: Node, name: str) -> None:
         self.scopes[-1][node] = name
-        if self.width == 1 and node in self.slots.places:
+        if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
 
     def _compute(self, node: Node) -> str:
@@ -124,10 +126,10 @@ class Writer:
         if product is not None:
             rest = node.args[0] if node.args[1] is product else node.args[1]
             names = [self.operand(n) for n in (*product.args, rest)]
-            return fused(node, product, names, self.width, self.add)
+            return fused(node, product, names, self.add)
         if node.op in CALLED:
             self.called.add(node.op)
-        return operation(node, [self.operand(a) for a in node.args], self.width, self.add)
+        return operation(node, [self.operand(a) for a in node.args], self.add)
 
     def operand(self, node: Node) -> str:
         """Return the name of a number in all lanes."""
@@ -139,7 +141,7 @@ class Writer:
             return name
         if node in self.mine and node.op != "counter":
             raise RuntimeError(f"{node} is used before it is computed")
-        name = self.scopes[-1][node] = self._everywhere(self.scalar(node), node.type)
+        name = self.scopes[-1][node] = self.everywhere(self.scalar(node), node.type)
         return name
 
     def scalar(self, node: Node) -> str:
@@ -151,7 +153,7 @@ class Writer:
             if key in scope:
                 return scope[key]
         if node in self.mine or any(node in scope for scope in self.scopes):
-            name = self.add(f"extractelement {vector(node.type, self.width)} {self.operand(node)}, i64 0")
+            name = self.add(f"extractelement {vector(node.type)} {self.operand(node)}, i64 0")
         elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
             name = self._scalar_load(node)
         else:
@@ -160,19 +162,19 @@ class Writer:
         return name
 
     def _is_scalar(self, node: Node) -> bool:
-        return node.op in ("constant", "counter") or node not in self.mine or self.width == 1
+        return node.op in ("constant", "counter") or node not in self.mine or self.single
 
-    def _everywhere(self, name: str, type: Type) -> str:
-        kind = vector(type, self.width)
+    def everywhere(self, name: str, type: Type) -> str:
+        """Return the name of a vector of a scalar."""
+        kind = vector(type)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
-        if self.width == 1:
+        if self.single:
             return first
-        return self.add(f"shufflevector {kind} {first}, {kind} poison, <{self.width} x i32> zeroinitializer")
+        return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
 
-    def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
-        """Return the address of entry offset + sum strides * indices, for entries of this many lanes."""
+    def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
+        """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
-        element = f"[{lanes} x i{BITS[owner.type]}]"
         base = self._base(owner)
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
@@ -182,9 +184,9 @@ class Writer:
                 for stride, index in zip(strides, indices, strict=True):
                     step = self.add(f"mul i64 {self.scalar(index)}, {stride}")
                     moved = self.add(f"add i64 {moved}, {step}") if moved else step
-                row = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {moved}")
+                row = self.scopes[-1][key] = self.add(f"getelementptr {entry}, ptr {base}, i64 {moved}")
             base = row
-        return self.add(f"getelementptr {element}, ptr {base}, i64 {offset + start}")
+        return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
     def _base(self, owner: Buffer) -> str:
         """Return the address of a buffer's memory, in this turn of the loops around it."""
@@ -212,17 +214,16 @@ class Writer:
         if not all(self._is_scalar(i) for i in node.args):
             return self._gather(node)
         if buffer.owner[0] not in self.spread:
-            return self._everywhere(self._scalar_load(node), node.type)
-        address = self._address(buffer, offset, strides, node.args, self.width)
+            return self.everywhere(self._scalar_load(node), node.type)
+        address = self._address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
-            bytes_ = self.add(f"load <{self.width} x i8>, ptr {address}, align 1")
-            return self.add(f"icmp ne <{self.width} x i8> {bytes_}, zeroinitializer")
-        return self.add(f"load {vector(node.type, self.width)}, ptr {address}, align {BITS[node.type] // 8}")
+            return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
+        return self.add(f"load {vector(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _scalar_load(self, node: Node) -> str:
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
-        address = self._address(buffer, offset, strides, node.args, 1)
+        address = self._address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
@@ -231,41 +232,32 @@ class Writer:
         """Load a number at a different place in each lane."""
         buffer, offset, strides = node.value
         owner, start = buffer.owner
-        lanes = self.width if owner in self.spread else 1
-        if lanes == 1:
+        bits, spread = BITS[node.type], owner in self.spread
+        if not spread:
             self.read.add(owner)
-        # Place of each lane: (offset + sum strides * indices) lanes + lane.
-        wide, kind = f"<{self.width} x i64>", vector(node.type, self.width)
-        positions = f"splat (i64 {(offset + start) * lanes})"
+        # Place of each lane: offset + sum strides * indices.
+        positions = f"splat (i64 {offset + start})"
         for stride, index in zip(strides, node.args, strict=True):
-            step = self.add(f"mul {wide} {self.operand(index)}, splat (i64 {stride * lanes})")
-            positions = self.add(f"add {wide} {step}, {positions}")
-        if lanes > 1:
-            numbers = ", ".join(f"i64 {lane}" for lane in range(self.width))
-            positions = self.add(f"add {wide} {positions}, <{numbers}>")
+            step = self.add(f"mul %i64 {self.operand(index)}, splat (i64 {stride})")
+            positions = self.add(f"add %i64 {step}, {positions}")
         # One load for each lane; booleans are stored as bytes.
-        bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
-        base, loaded = self._base(owner), "poison"
-        for lane in range(self.width):
-            at = self.add(f"extractelement {wide} {positions}, i64 {lane}")
-            address = self.add(f"getelementptr i{bits}, ptr {base}, i64 {at}")
-            entry = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
-            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {entry}, i64 {lane}")
+        self.gathered.add((bits, spread))
+        loaded = self.add(f"call %i{bits} @{gather_name(bits, spread)}(ptr {self._base(owner)}, %i64 {positions})")
         if node.type == "bool":
-            return self.add(f"icmp ne {values} {loaded}, zeroinitializer")
-        return self.add(f"bitcast {values} {loaded} to {kind}") if node.type == "f64" else loaded
+            return self.add(f"icmp ne %i8 {loaded}, zeroinitializer")
+        return self.add(f"bitcast %i64 {loaded} to %double") if node.type == "f64" else loaded
 
     def _store(self, store: Store) -> None:
-        name, kind = self.operand(store.node), vector(store.node.type, self.width)
-        lanes = self.sums.get(store.buffer, self.width)
-        address = self._address(store.buffer, store.offset, store.strides, store.indices, lanes)
+        name, kind, bits = self.operand(store.node), vector(store.node.type), BITS[store.node.type]
+        entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
+        address = self._address(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:
             before = self.add(f"load {kind}, ptr {address}, align 8")
-            counted = self.add(f"select <{self.width} x i1> {self.counted}, {kind} {name}, {kind} zeroinitializer")
+            counted = self.add(f"select %i1 {self.counted}, {kind} {name}, {kind} zeroinitializer")
             name = self.add(f"fadd {kind} {before}, {counted}")
         if store.node.type == "bool":
-            name, kind = self.add(f"zext {kind} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
-        self.line(f"store {kind} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
+            name, kind = self.add(f"zext {kind} {name} to %i8"), "%i8"
+        self.line(f"store {kind} {name}, ptr {address}, align {bits // 8}")
 
     def _loop(self, loop: Loop) -> None:
         """Write a loop: parameters are phi nodes of the carry; a counted loop has at least one turn."""
@@ -301,7 +293,7 @@ class Writer:
         # The phi nodes come first, but their arguments are known only now.
         phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
         for k, start, after in zip(moving, starts, following, strict=True):
-            kind = vector(loop.parameters[k].type, self.width)
+            kind = vector(loop.parameters[k].type)
             phis.append(f"  %{name}.p{k} = phi {kind} [{start}, %{before}], [{after}, %{self.label}]")
         self.lines[begin:begin] = phis
         self.start(f"{name}.end")
@@ -331,9 +323,7 @@ class Writer:
 
     def _any(self, condition: Node) -> str:
         """Emit whether a condition holds in some lane."""
-        flags = f"<{self.width} x i1>"
-        bits = self.add(f"bitcast {flags} {self.operand(condition)} to i{self.width}")
-        return self.add(f"icmp ne i{self.width} {bits}, 0")
+        return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.operand(condition)} to %lanes')}, 0")
 
     def _guard(self, guard: Guard) -> None:
         self.count += 1
@@ -353,5 +343,5 @@ class Writer:
         self.scopes.pop()
         # Results are zero where the body was skipped.
         for k, value in zip(used, values, strict=True):
-            kind = vector(guard.results[k].type, self.width)
+            kind = vector(guard.results[k].type)
             self._keep(guard.results[k], self.add(f"phi {kind} [{value}, %{after}], [zeroinitializer, %{before}]"))

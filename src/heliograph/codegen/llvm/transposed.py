@@ -33,7 +33,7 @@ class Lines:
         self.lines += [f"  br label %{head}", f"{after}:"]
 
 
-def mover(bits: int, width: int, inwards: bool) -> str:
+def mover(bits: int, inwards: bool, width: int) -> str:
     """Write `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which moves back.
 
     Lane l is run first + l, or the last run if there are fewer: it then repeats the computation of that run.

@@ -8,6 +8,7 @@ its flag jax_threefry_partitionable.
 """
 
 import math
+from functools import cache
 from typing import Any
 
 import jax
@@ -146,10 +147,10 @@ def hashed(first: Word, second: Word, high: Word, low: Word) -> Word:
     return x << 32 | y
 
 
-def hash_function(width: int) -> str:
-    """Write `define internal <W x i64> @hg_threefry(<W x i32> ...)` of a key's and a counter's two words."""
-    vector = f"<{width} x i32>"
-    rotate = f"@llvm.fshl.v{width}i32"
+@cache
+def hash_function() -> str:
+    """Write `define internal %i64 @hg_threefry(%i32 ...)` of a key's and a counter's two words."""
+    vector, wide = "%i32", "%i64"
     lines: list[str] = []
 
     def op(text: str) -> str:
@@ -164,18 +165,14 @@ def hash_function(width: int) -> str:
     for four in range(5):
         for bits in ROTATIONS[four % 2]:
             x = op(f"add {vector} {x}, {y}")
-            y = op(f"call {vector} {rotate}({vector} {y}, {vector} {y}, {vector} splat (i32 {bits}))")
+            y = op(f"call {vector} @llvm.fshl({vector} {y}, {vector} {y}, {vector} splat (i32 {bits}))")
             y = op(f"xor {vector} {y}, {x}")
         x = op(f"add {vector} {x}, {keys[(four + 1) % 3]}")
         y = op(f"add {vector} {y}, {keys[(four + 2) % 3]}")
         y = op(f"add {vector} {y}, splat (i32 {four + 1})")
     # Both words as one of 64 bits.
-    wide = f"<{width} x i64>"
     high, low = op(f"zext {vector} {x} to {wide}"), op(f"zext {vector} {y} to {wide}")
     word = op(f"or {wide} {op(f'shl {wide} {high}, splat (i64 32)')}, {low}")
     words = ", ".join(f"{vector} %{name}" for name in "abxy")
     body = "\n".join(lines)
-    return (
-        f"declare {vector} {rotate}({vector}, {vector}, {vector})\n"
-        f"define internal {wide} @hg_threefry({words}) noinline nounwind {{\n{body}\n  ret {wide} {word}\n}}\n"
-    )
+    return f"define internal {wide} @hg_threefry({words}) noinline nounwind {{\n{body}\n  ret {wide} {word}\n}}\n"

@@ -48,19 +48,18 @@ SCALAR = {
 }
 
 
-def functions(width: int, names: Iterable[str]) -> str:
-    """Return the text of `define internal <W x double> @hg_NAME(<W x double> ...)` for each name, with declarations."""
-    texts, declared = [], set()
-    for name in sorted(set(names)):
-        text, needs = function(name, width, *FUNCTIONS[name]) if name in FUNCTIONS else _by_number(name, width)
-        texts.append(text)
-        declared |= needs
-    return "\n".join([*sorted(declared), *texts, ATTRIBUTES])
+def functions(names: Iterable[str], width: int) -> str:
+    """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations."""
+    names = sorted(set(names))
+    scalar = [name for name in names if name in SCALAR]
+    declared = [f"declare double @{name}({', '.join(['double'] * SCALAR[name])})\n" for name in scalar]
+    texts = [_by_number(name, width) if name in SCALAR else function(name, *FUNCTIONS[name]) for name in names]
+    return "\n".join([*declared, *texts, ATTRIBUTES])
 
 
-def _by_number(name: str, width: int) -> tuple[str, set[str]]:
+def _by_number(name: str, width: int) -> str:
     """Write a function that calls the scalar library for each number."""
-    double, count = f"<{width} x double>", SCALAR[name]
+    double, count = "%double", SCALAR[name]
     lines, total = [], "poison"
     for lane in range(width):
         for i in range(count):
@@ -71,5 +70,4 @@ def _by_number(name: str, width: int) -> tuple[str, set[str]]:
         total = f"%r{lane}"
     signature = ", ".join(f"{double} %x{i}" for i in range(count))
     body = "".join(f"  {line}\n" for line in lines)
-    text = f"define internal {double} @hg_{name}({signature}) #9 {{\n{body}  ret {double} {total}\n}}\n"
-    return text, {f"declare double @{name}({', '.join(['double'] * count)})"}
+    return f"define internal {double} @hg_{name}({signature}) #9 {{\n{body}  ret {double} {total}\n}}\n"

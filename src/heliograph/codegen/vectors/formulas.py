@@ -7,6 +7,7 @@ number. Operations are written as they stand: no contraction, no reordering; `fm
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TypeAlias
 
 Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of it
@@ -14,16 +15,14 @@ Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of i
 
 @dataclass
 class Body:
-    """Operations of one function on vectors of `width` numbers, and the intrinsics that they call."""
+    """Operations of one function on vectors, of as many numbers as the text that it stands in says."""
 
-    width: int
     lines: list[str] = field(default_factory=list)
-    declared: set[str] = field(default_factory=set)
     block: str = "entry"
 
     def type(self, scalar: str) -> str:
-        """Return the type of a vector of these scalars, such as "<8 x double>"."""
-        return f"<{self.width} x {scalar}>"
+        """Return the name of the type of a vector of these scalars, such as "%double"."""
+        return f"%{scalar}"
 
     def add(self, scalar: str, operation: str) -> "Vector":
         """Append an operation; return its result, a vector of these scalars."""
@@ -35,9 +34,7 @@ class Body:
         """Return `costly` where needed, else the value, with a jump past its operations if no lane needs it."""
         start, mark = self.block, len(self.lines)
         truth, double = self.type("i1"), self.type("double")
-        reduce = f"@llvm.vector.reduce.or.v{self.width}i1"
-        self.declared.add(f"declare i1 {reduce}({truth})")
-        self.lines.append(f"%some{mark} = call i1 {reduce}({truth} {needed.name})")
+        self.lines.append(f"%some{mark} = call i1 @llvm.vector.reduce.or({truth} {needed.name})")
         self.lines.append(f"br i1 %some{mark}, label %costly{mark}, label %end{mark}")
         self.lines.append(f"costly{mark}:")
         chosen = select(needed, costly(), value)
@@ -49,9 +46,7 @@ class Body:
     def call(self, intrinsic: str, *args: "Vector") -> "Vector":
         """Return the result of an LLVM intrinsic of doubles, such as "fma"."""
         double = self.type("double")
-        name = f"@llvm.{intrinsic}.v{self.width}f64"
-        self.declared.add(f"declare {double} {name}({', '.join([double] * len(args))})")
-        return self.add("double", f"call {double} {name}({', '.join(f'{double} {a.name}' for a in args)})")
+        return self.add("double", f"call {double} @llvm.{intrinsic}({', '.join(f'{double} {a.name}' for a in args)})")
 
 
 def _operator(real: str, whole: str, turned: bool = False) -> Callable[["Vector", Operand], "Vector"]:
@@ -157,12 +152,12 @@ def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
     return x.like(total)
 
 
-def function(name: str, width: int, formula: Callable[..., Vector], arguments: int = 1) -> tuple[str, set[str]]:
-    """Return the text of an internal function of vectors of doubles, and its declarations."""
-    body = Body(width)
+@cache
+def function(name: str, formula: Callable[..., Vector], arguments: int = 1) -> str:
+    """Return the text of an internal function of vectors of doubles."""
+    body = Body()
     double = body.type("double")
     value = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))
     lines = "".join(f"  {line}\n" for line in body.lines)
     signature = ", ".join(f"{double} %x{i}" for i in range(arguments))
-    text = f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {value.name}\n}}\n"
-    return text, body.declared
+    return f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {value.name}\n}}\n"
