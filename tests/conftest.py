@@ -92,6 +92,14 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 100)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Tests trace from deep within pytest: they have room on the interpreter's stack."""
+    from heliograph.numerics.stack import with_room
+
+    return with_room(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
+
+
 @pytest.fixture(scope="session")
 def memory_left():
     """Of this process after it let go, in bytes: a list, to which is added each time."""

@@ -15,8 +15,9 @@ def command() -> NoReturn:
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # while it is imported there is nothing to undo
     gc.set_threshold(*RARELY)
     from heliograph.cli import INTERRUPTED, main
+    from heliograph.numerics.stack import with_room
 
-    code = main()
+    code = with_room(main)()
     if code == INTERRUPTED:  # what other threads still compute is not waited for
         sys.stdout.flush()
         sys.stderr.flush()

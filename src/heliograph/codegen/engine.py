@@ -21,6 +21,7 @@ from heliograph.codegen.program import lower
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.collector import no_collector
+from heliograph.numerics.stack import with_room
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
@@ -142,7 +143,7 @@ def attempted(make: Callable[[], Code]) -> Code | None:
         return None
     try:
         with no_collector():
-            return make()
+            return with_room(make)()
     except Unsupported as error:
         if engine == "native":
             raise fail("native code", "a program of operations that it takes", str(error)) from None
@@ -191,6 +192,7 @@ class _Array(NamedTuple):
 
 
 @lru_cache(COMPILED)
+@with_room
 @no_collector()
 def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None, str]:
     """Compile code for one structure, and the shapes and types of its arrays."""
