@@ -1,4 +1,4 @@
-"""Room on the interpreter's stack: the same function, whose inner calls map no memory again and again."""
+"""Room on the interpreter's stack: the same function, and calls within it that map no memory again and again."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor

@@ -72,14 +72,12 @@ def often(operations: int) -> float:
 WIDEST = 8  # runs of a vector: one register of the widest processors, two of others; more only spill
 
 
-@cache
 def narrow() -> int:
-    """Return the runs of one register where it has fewer than WIDEST: in haste as fast as two, and sooner generated.
+    """Return the runs of one register, at most WIDEST: for code in haste, which is sooner generated so.
 
     LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
     """
-    wide = llvm.get_host_cpu_features().get("avx512f", False)
-    return WIDEST if wide else WIDEST // 2
+    return WIDEST if "+avx512f" in features()[1].split(",") else WIDEST // 2
 
 
 class Tiers:

@@ -1,7 +1,7 @@
 """Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
 
-Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, so
-that W consecutive runs of a block never wrap around; what is beyond the end is added to the beginning (`folded`).
+Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, W the
+most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`folded`).
 """
 
 from collections.abc import Callable, Iterable, Sequence

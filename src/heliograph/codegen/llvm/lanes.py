@@ -2,6 +2,8 @@
 
 from functools import cache
 
+from heliograph.codegen.llvm.transposed import Lines
+
 
 @cache
 def types(width: int) -> str:
@@ -10,7 +12,7 @@ def types(width: int) -> str:
     return "".join([*vectors, f"%lanes = type i{width}\n"])
 
 
-# The address of the second vector of bytes from none is W.
+# W as a number: the size of a vector of bytes.
 WIDTH = "ptrtoint (ptr getelementptr (%i8, ptr null, i64 1) to i64)"
 
 
@@ -27,14 +29,13 @@ def gather_name(bits: int, spread: bool) -> str:
 
 def gather(bits: int, spread: bool, width: int) -> str:
     """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, a load for each lane; of its entries if `spread`."""
-    vector, lines, total = f"%i{bits}", [], "poison"
+    vector, text, total = f"%i{bits}", Lines(), "poison"
+    row, entry = (f"[{width} x i{bits}]", ", i64 {}") if spread else (f"i{bits}", "")
     for lane in range(width):
-        lines.append(f"%p{lane} = extractelement %i64 %places, i64 {lane}")
-        row, index = (f"[{width} x i{bits}]", f", i64 {lane}") if spread else (f"i{bits}", "")
-        lines.append(f"%a{lane} = getelementptr {row}, ptr %start, i64 %p{lane}{index}")
-        lines.append(f"%x{lane} = load i{bits}, ptr %a{lane}, align {bits // 8}")
-        lines.append(f"%r{lane} = insertelement {vector} {total}, i{bits} %x{lane}, i64 {lane}")
-        total = f"%r{lane}"
-    body = "".join(f"  {line}\n" for line in lines)
+        index = text.add(f"extractelement %i64 %places, i64 {lane}")
+        address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{entry.format(lane)}")
+        number = text.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+        total = text.add(f"insertelement {vector} {total}, i{bits} {number}, i64 {lane}")
     head = f"define internal {vector} @{gather_name(bits, spread)}(ptr %start, %i64 %places) noinline nounwind"
-    return f"{head} {{\n{body}  ret {vector} {total}\n}}\n"
+    body = "\n".join(text.lines)
+    return f"{head} {{\n{body}\n  ret {vector} {total}\n}}\n"

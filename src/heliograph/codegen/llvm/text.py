@@ -77,7 +77,7 @@ class Writer:
         self.label = "entry"
         self.count = 0
         self.called: set[str] = set()
-        self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has its own
+        self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
         self.turning: Collection[Buffer] = ()  # shared buffers within loops that have a place for each turn

@@ -1,11 +1,11 @@
 """Transposition of arrays [run][entry] to [entry][lane] for a block of runs, and back, as text of LLVM IR.
 
-64-bit numbers are moved eight runs by eight entries at a time, as vectors; others one by one.
+64-bit numbers are moved in squares, of eight runs by eight entries or as many as a vector has; others one by one.
 """
 
 from collections.abc import Callable
 
-EIGHT = 8
+SIDE = 8  # runs and entries of the largest square
 
 
 class Lines:
@@ -40,40 +40,41 @@ def mover(bits: int, inwards: bool, width: int) -> str:
     """
     text, name = Lines(), f"{'take' if inwards else 'give'}{bits}"
     bytes_ = bits // 8
-    for group in range(0, width, EIGHT):
-        lanes = min(EIGHT, width - group)
+    side = min(SIDE, width)
+    for group in range(0, width, side):
         # Address of each lane's run.
         rows = []
-        for lane in range(group, group + lanes):
+        for lane in range(group, group + side):
             run = text.add(f"add i64 %first, {lane}")
             run = text.add(f"call i64 @llvm.smin.i64(i64 {run}, i64 %last)")
             start = text.add(f"mul i64 {run}, %size")
             rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
-        # Squares of eight by eight, then the remaining entries.
+        # Squares, then the remaining entries.
         start = "0"
-        if lanes == EIGHT and bits == 64:
-            text.loop(f"g{group}", "0", "%size", EIGHT, _eight(text, rows, width, group, inwards))
-            start = text.add(f"and i64 %size, {-EIGHT}")
+        if bits == 64:
+            text.loop(f"g{group}", "0", "%size", side, _square(text, rows, width, group, inwards))
+            start = text.add(f"and i64 %size, {-side}")
         text.loop(f"h{group}", start, "%size", 1, _single(text, rows, width, group, bits, inwards))
     body = "\n".join(text.lines)
     arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
     return f"define internal void @{name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}} ; {bytes_}\n"
 
 
-def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) -> Callable[[str], None]:
-    """Move eight entries of eight lanes."""
+def _square(text: Lines, rows: list[str], width: int, group: int, inwards: bool) -> Callable[[str], None]:
+    """Move as many entries as there are lanes."""
 
     def body(i: str) -> None:
-        vector = "<8 x i64>"
+        vector = f"<{len(rows)} x i64>"
         in_rows = [text.add(f"getelementptr i64, ptr {row}, i64 {i}") for row in rows]
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"getelementptr i64, ptr %lanes, i64 {base}")
-        in_lanes = [text.add(f"getelementptr i64, ptr {base}, i64 {k * width + group}") for k in range(EIGHT)]
+        in_lanes = [text.add(f"getelementptr i64, ptr {base}, i64 {k * width + group}") for k in range(len(rows))]
         sources, targets = (in_rows, in_lanes) if inwards else (in_lanes, in_rows)
-        loaded = [text.add(f"load {vector}, ptr {p}, align 8") for p in sources]
-        for half in (4, 2, 1):
-            loaded = _exchanged(text, loaded, half)
-        for p, x in zip(targets, loaded, strict=True):
+        moved = [text.add(f"load {vector}, ptr {p}, align 8") for p in sources]
+        half = len(rows) // 2
+        while half:
+            moved, half = _exchanged(text, moved, half), half // 2
+        for p, x in zip(targets, moved, strict=True):
             text.lines.append(f"  store {vector} {x}, ptr {p}, align 8")
 
     return body
@@ -81,17 +82,17 @@ def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) 
 
 def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
     """Do one step of a transposition: exchange off-diagonal squares of this size."""
-    exchanged = rows[:]
-    for i in range(EIGHT):
+    exchanged, side = rows[:], len(rows)
+    for i in range(side):
         if i & half:
             continue
         j = i | half
-        low = [k if not k & half else k - half + EIGHT for k in range(EIGHT)]
-        high = [k + half if not k & half else k + EIGHT for k in range(EIGHT)]
+        low = [k if not k & half else k - half + side for k in range(side)]
+        high = [k + half if not k & half else k + side for k in range(side)]
         for row, order in ((i, low), (j, high)):
             mask = ", ".join(f"i32 {k}" for k in order)
-            pair = f"<8 x i64> {rows[i]}, <8 x i64> {rows[j]}"
-            exchanged[row] = text.add(f"shufflevector {pair}, <8 x i32> <{mask}>")
+            pair = f"<{side} x i64> {rows[i]}, <{side} x i64> {rows[j]}"
+            exchanged[row] = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return exchanged
 
 
