@@ -3,6 +3,7 @@
 from .base import (
     AbstractFilter as AbstractFilter,
     corrects as corrects,
+    estimates as estimates,
     in_float64 as in_float64,
     predicts as predicts,
 )

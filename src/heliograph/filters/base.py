@@ -25,8 +25,8 @@ from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
-    "AbstractFilter", "AbstractSizedFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts",
-    "step_number",
+    "AbstractFilter", "AbstractSizedFilter", "Step", "corrects", "estimates", "given", "in_float64", "measured",
+    "predicts", "step_number",
 ]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
@@ -50,8 +50,8 @@ class AbstractFilter(Module):
     one in its state, into which it folds the data (`docs/extend.md` has one). A component of z that is NaN did not
     arrive and is skipped. The state is a pytree of arrays, so one filter object serves a stream, a recording and
     thousands of runs at once.
-    To write one: give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and
-    `estimate` under `@in_float64` where they compute anything. Data of other sizes than these fields state are refused.
+    To write one: give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `estimate`
+    under `@estimates`, and `init` under `@in_float64` where it computes anything. Data of other sizes are refused.
 
     Args:
         claim: what the covariance is: "exact", "upper", "nominal" or "none".
@@ -84,7 +84,11 @@ class AbstractFilter(Module):
         raise NotImplementedError
 
     def estimate(self, state: PyTree) -> Estimate:
-        """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`."""
+        """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`.
+
+        Raises:
+            ValueError: what is no state of such a filter.
+        """
         raise NotImplementedError
 
     def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
@@ -219,7 +223,7 @@ def _with_state(filter: AbstractFilter, state: PyTree, function: Callable[..., R
     """Call `function(filter, state, *data)`; where it fails with no state of the filter, say so."""
     try:
         return function(filter, state, *data)
-    except (AttributeError, IndexError, TypeError):
+    except (AttributeError, IndexError, TypeError, ValueError):
         # A user's call says it, of the state that was given; those within its trace only fail.
         if is_traced(state) or _form(state) == _form(filter.init()):
             raise
@@ -275,6 +279,21 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
     return _checked(correct, measured)
+
+
+def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
+    """Compute a filter's `estimate(state)` in double precision, and refuse what is no state of such a filter.
+
+    Args:
+        estimate: the method of a filter.
+    """
+    run = cast(Callable[..., R], in_float64(estimate))
+
+    @wraps(estimate)
+    def call(filter: AbstractFilter, state: PyTree) -> R:
+        return _with_state(filter, state, run)
+
+    return cast(Callable[P, R], call)
 
 
 def _checked(

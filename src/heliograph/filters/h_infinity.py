@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Estimate, Innovation
@@ -70,7 +70,7 @@ class HInfinityFilter(AbstractSizedFilter):
         nothing = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
         return Pending(state.mean, later), Innovation(value, jnp.full((len(value), len(value)), jnp.nan), nothing)
 
-    @in_float64
+    @estimates
     def estimate(self, state: Pending) -> Estimate:
         """Mean of the state, without a covariance."""
         n = state.mean.shape[0]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.ball import cut_to_ball
 from heliograph.filters.event.moments import arriving, augmented, moved, updated
 from heliograph.filters.event.parts import FLOOR, Parts, cut, cut_away, join, log_total, reduced, safe_log, together
@@ -22,7 +22,6 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractThreshold
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
@@ -332,7 +331,7 @@ class EventFilter(AbstractSizedFilter):
         forbidden = ~jnp.isfinite(log_total(parts.log_weight))
         return Parts(*(jnp.where(forbidden, x, y) for x, y in zip(stays, parts, strict=True)))
 
-    @in_float64
+    @estimates
     def estimate(self, state: EventBelief) -> Estimate:
         """Mean and covariance of the whole sum."""
         return Estimate(*self._whole(state), self.claim)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.parts import FLOOR, Parts, join, safe_log, together
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
@@ -25,7 +25,6 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import Periodic, StochasticTrigger
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -206,7 +205,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         log_silent = density + self._log_height()
         return log_silent, Belief(prior.mean + value @ solved, covariance)
 
-    @in_float64
+    @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
         """The Gaussian."""
         return Estimate(state.mean, state.covariance, self.claim)

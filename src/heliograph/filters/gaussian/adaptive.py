@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
@@ -108,7 +108,7 @@ class AdaptiveFilter(AbstractSizedFilter):
         innovation = Innovation(value, jnp.where(both, covariance, jnp.nan), density, learned.weight)
         return learned.after, innovation
 
-    @in_float64
+    @estimates
     def estimate(self, state: AdaptiveBelief) -> Estimate:
         """The filter's own."""
         posterior = self.base.estimate(Belief(state.mean, state.covariance))

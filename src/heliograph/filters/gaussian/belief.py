@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Transformed, linear_transform
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -48,7 +48,7 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         """Mean and covariance of f(x, u) + w."""
         return Belief(*predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))[:2])
 
-    @in_float64
+    @estimates
     def estimate(self, state: Belief) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.factors import (
     Columns,
     Factors,
@@ -156,7 +156,7 @@ class FactoredFilter(AbstractSizedFilter):
         total = sum_of(joined([known, masked]))
         return FactoredBelief(after, state.before_data), gaussian_innovation(z, expected, total)
 
-    @in_float64
+    @estimates
     def estimate(self, state: FactoredBelief) -> Estimate:
         """Mean of the estimate, angles between -pi and pi, and its covariance."""
         mean, factors = state.estimate

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -62,7 +62,7 @@ class SequentialFilter(AbstractSizedFilter):
             parts.append(single)
         return state, _joined(parts)
 
-    @in_float64
+    @estimates
     def estimate(self, state: Belief) -> Estimate:
         """Mean and covariance of the belief, by the first node's filter."""
         posterior = self.filters[0].estimate(state)

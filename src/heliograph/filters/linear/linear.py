@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import corrected, describe, with_known
@@ -95,7 +95,7 @@ class LinearFilter(AbstractSizedFilter):
         plant, sensor, channel = at(self.plant, 0), at(self.sensor, k), at(self.channel, k)
         return corrected_linear(state, sensor, channel, self.rule, jnp.asarray(z), initial_size(plant))
 
-    @in_float64
+    @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
         """Mean and covariance of the estimate."""
         return Estimate(state.mean, state.covariance, self.claim)

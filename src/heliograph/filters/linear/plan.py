@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.codegen.engine import SHORT, computed
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.estimate import Estimate, Innovation
@@ -80,7 +80,7 @@ class PlannedFilter(AbstractSizedFilter):
         mean = _affine(p.gain, jnp.asarray(z) - expected, state.mean)
         return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(jnp.asarray(z), expected, p.innovation)
 
-    @in_float64
+    @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
         """Mean of the state, with the planned covariance."""
         return self._estimate(state.mean, state.stage)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
@@ -152,7 +152,7 @@ class PolynomialFilter(AbstractSizedFilter):
         after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
         return Centred(after, state.mean), _of_degree_one(innovation, z, self.degree)
 
-    @in_float64
+    @estimates
     def estimate(self, state: Centred) -> Estimate:
         """Estimate of the inner filter, plus the mean."""
         return _moved(self.inner.estimate(state.inner), state.mean)
@@ -324,7 +324,7 @@ class MemoryFilter(AbstractSizedFilter):
         products, innovation = self.products.correct(state.products, lifted, k)
         return MemoryState(linear, products, state.mean), _of_degree_one(innovation, z, 2)
 
-    @in_float64
+    @estimates
     def estimate(self, state: MemoryState) -> Estimate:
         """Estimate of the filter of products, plus the mean."""
         return _moved(self.products.estimate(state.products), state.mean)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import covariance_after
 from heliograph.filters.gaussian.precise import above_rounding, state_rounding
@@ -106,7 +106,7 @@ class ScheduledFilter(AbstractSizedFilter):
         )
         return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
 
-    @in_float64
+    @estimates
     def estimate(self, state: ScheduleState) -> Estimate:
         """Mean of the estimate, with the schedule's covariance while all has arrived."""
         return self._estimate(state, state.stage)
@@ -184,7 +184,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         after = Belief(mean + solved.T @ jnp.where(present, z - expected, 0.0), left)
         return after, gaussian_innovation(z, expected, total)
 
-    @in_float64
+    @estimates
     def estimate(self, state: Belief) -> Estimate:
         """Mean and covariance of the plant's states, by the projection."""
         projection = jnp.asarray(self.projection)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -23,7 +23,6 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import above_products, cholesky, psd_solve, symmetrize, with_rounding
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
@@ -241,7 +240,7 @@ class MixtureFilter(AbstractSizedFilter):
         updated = MixtureBelief(mean + shift, after, modes, state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
-    @in_float64
+    @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)

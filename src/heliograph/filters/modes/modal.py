@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_covariance
 from heliograph.filters.gaussian.precise import (
     above_rounding,
@@ -31,7 +31,6 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import above_products, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stacked
@@ -78,7 +77,7 @@ class AbstractModalFilter(AbstractSizedFilter):
     channel: ObservationModel | OverTime
     initial: Float[Array, " M"]
 
-    @in_float64
+    @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """x = sum_j zeta^j."""
         projection = self._projection()

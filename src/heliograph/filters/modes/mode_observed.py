@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.linear import LinearBelief, Move, corrected_linear, predicted, prior_belief
@@ -22,7 +22,6 @@ from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, given, memories
 from heliograph.random_affine.combine import Mixture
@@ -110,7 +109,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
-    @in_float64
+    @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:
         """Mean and covariance of the estimate."""
         return Estimate(state.belief.mean, state.belief.covariance, self.claim)

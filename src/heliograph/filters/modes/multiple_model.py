@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import corrected, signal_of
@@ -29,7 +29,6 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
@@ -219,7 +218,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
         return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
 
-    @in_float64
+    @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
         whole = _whole(state)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -99,7 +99,7 @@ class ParticleFilter(AbstractSizedFilter):
         weight = jnp.where(poor, 1 / self.particles, weight)
         return Particles(after.mean[which], after.covariance[which], state.mode[which], weight, key, state.moved), mixed
 
-    @in_float64
+    @estimates
     def estimate(self, state: Particles) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
         whole, _ = merged(state.mean, state.covariance, state.weight[:, None])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, is_precise
 from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.innovation import log_density
@@ -32,7 +32,6 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, probabilities
-from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.lapack import pseudo_solve
 from heliograph.numerics.linalg import PRECISE, rounding, spread_of, symmetrize
 from heliograph.numerics.module import Module
@@ -172,7 +171,7 @@ class SideInformationFilter(AbstractSizedFilter):
             value = jnp.append(value, nis)
         return after, Innovation(value, covariance, likelihood)
 
-    @in_float64
+    @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
         """x - c = sum_j zeta^j."""
         projection = sum_of_modes(len(self.states), len(self.initial))

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
@@ -140,7 +140,7 @@ class ClockFilter(AbstractSizedFilter):
         _, squares = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
-    @in_float64
+    @estimates
     def estimate(self, state: ClockBelief) -> Estimate:
         """Mean and covariance of the belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts, sized
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
@@ -51,7 +51,7 @@ class AbstractPartFilter(AbstractSizedFilter):
         """Correct with the larger filter."""
         return self.base.correct(state, z, k)
 
-    @in_float64
+    @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Mean and covariance of the first states."""
         return self._part(self.base.estimate(state))
@@ -246,7 +246,7 @@ class LateFilter(AbstractSizedFilter):
         published = jax.tree.map(lambda now, before: jnp.where(then >= 0, now, before), innovation, early)
         return state._replace(base=base), Innovation(published.value, published.covariance, innovation.log_likelihood)
 
-    @in_float64
+    @estimates
     def estimate(self, state: LateState) -> Estimate:
         """Prediction over the last `delay` steps."""
 

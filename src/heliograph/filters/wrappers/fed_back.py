@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -59,7 +59,7 @@ class PredictionFilter(AbstractSizedFilter):
         belief, innovation = self.base.correct(state.belief, z, k)
         return Ahead(belief, state.prior), innovation
 
-    @in_float64
+    @estimates
     def estimate(self, state: Ahead) -> Estimate:
         """Mean and covariance of the prediction."""
         return self.base.estimate(state.prior)
@@ -134,7 +134,7 @@ class FedBackFilter(AbstractSizedFilter):
         after, innovation = corrected(prior, sent, at(base.channel, k), base.rule, jnp.asarray(z), size)
         return FedBackBelief(*after, state.reference), innovation
 
-    @in_float64
+    @estimates
     def estimate(self, state: FedBackBelief) -> Estimate:
         """Mean and covariance of the belief."""
         return Estimate(state.mean, state.covariance, self.claim)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.innovation import gaussian_innovation
@@ -35,7 +35,7 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, stack,
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.erasure import arrived
@@ -360,7 +360,7 @@ class CentreFilter(AbstractSizedFilter):
         mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 
-    @in_float64
+    @estimates
     def estimate(self, state: CentreBelief) -> Estimate:
         """Best linear estimate of the plant's state."""
         return Estimate(*fused_estimate(state.known, len(self.states)), self.claim)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.innovation import gaussian_innovation, no_innovation
 from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.quantizer import AbstractQuantizer
@@ -80,7 +80,7 @@ class NodeFilter(AbstractSizedFilter):
         innovation = gaussian_innovation(jnp.concatenate(sensed), gain @ mean + offset, total)
         return self._after(state.before, jnp.asarray(z), state.inputs, k), innovation
 
-    @in_float64
+    @estimates
     def estimate(self, state: NodeState) -> Estimate:
         """Mean and covariance of the node."""
         return Estimate(jnp.asarray(state.now.mean)[0], jnp.asarray(state.now.covariance)[0], self.claim)
