@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from heliograph.codegen.program import lower
 from heliograph.numerics.linalg import times
 from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
 
@@ -46,6 +47,17 @@ def test_a_kernel_that_says_its_shapes_is_traced_for_all_runs_alone():
     assert seen == [(2, 2, 4)] and traces.dtype == np.float64, seen
     np.testing.assert_allclose(result, A[0] @ B, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(traces, np.trace(A[0], axis1=1, axis2=2), rtol=1e-15)
+
+
+def test_native_code_is_made_of_the_trace_that_gave_the_shapes():
+    @runs_last
+    def trace(a):
+        seen.append(a.shape)
+        return a[0, 0] + a[1, 1]
+
+    seen.clear()
+    program = lower(lambda a: trace(a) + trace(2 * a), B)
+    assert seen == [(2, 2)] and len(program.outputs) == 1
 
 
 def test_results_that_no_run_has_a_part_in_come_for_each():

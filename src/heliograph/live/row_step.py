@@ -99,7 +99,6 @@ class Layout(NamedTuple):
 
     static: Static
     state: Flat
-    outputs: Flat
     received: int
     inputs: int
 
@@ -127,12 +126,12 @@ class RowStep:
         numbers, static = cast(NetworkStep(network, filters))
         self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
-        self.outputs = _outputs(static, self._like, self.state, received, inputs)
+        self._layout = Layout(static, self.state, received, inputs)
+        self.outputs = _outputs(self._layout, self._like)
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
-        self._layout = Layout(static, self.state, self.outputs, received, inputs)
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
-        self._choice = chosen(_stepped(self._layout), (self._numbers, row), (False, True))
+        self._choice = chosen(_in_rows(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first(*self._numbers)
         if self._code is not None:
@@ -154,7 +153,7 @@ class RowStep:
             stepped: np.ndarray = self._code(rows)
             return stepped
         width, together = (1, 1) if alone else (WIDTH, TOGETHER)
-        run = _by_xla(self._layout, width, together)
+        run = _by_xla(self._layout, self.outputs, width, together)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
@@ -167,35 +166,44 @@ class RowStep:
 
 @lru_cache
 def _stepped(layout: Layout) -> Any:
-    """Return the function of one row, the same one for layouts that are equal, traced once for its code and text."""
+    """Return the function of one row to states and outputs, traced once for the outputs' layout, code and text."""
 
-    def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
-        after, outputs = layout.static.filled(numbers).step(*layout.parts(row))
-        return jnp.concatenate([row_of(after), row_of(outputs)])
+    def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
+        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.parts(row))
+        return stepped
 
     return jax.jit(step, inline=True)
 
 
 @lru_cache
-def _outputs(
-    static: Static, numbers: tuple[jax.ShapeDtypeStruct, ...], state: Flat, received: int, inputs: int
-) -> Flat:
-    """Return the layout of a step's outputs: it is traced once for networks that differ in numbers alone."""
-    before = state.structure.unflatten(map(like, state.shapes, map(np.dtype, state.kinds)))
-    data = list(numbers), before, np.zeros(received), np.zeros(inputs), np.asarray(0)
+def _in_rows(layout: Layout) -> Any:
+    """Return the function of one row to another, the same one for layouts that are equal."""
+
+    def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
+        return jnp.concatenate([row_of(tree) for tree in _stepped(layout)(numbers, row)])
+
+    return step
+
+
+@lru_cache
+def _outputs(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Flat:
+    """Return the layout of a step's outputs, once for networks that differ in numbers alone."""
+    return flat_like(_traced(layout, numbers).out_info[1])
+
+
+def _traced(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
     with jax.enable_x64(True):
-        return flat_like(jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], *data))
+        return _stepped(layout).trace(list(numbers), like((layout.size,), np.float64))
 
 
 @lru_cache(TEXTS)
 def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the step as text, once for networks that differ in numbers alone."""
-    with jax.enable_x64(True):
-        return text_of(_stepped(layout).trace(list(numbers), np.zeros(layout.size)).jaxpr)
+    return text_of(_traced(layout, numbers).jaxpr)
 
 
 @lru_cache
-def _by_xla(layout: Layout, width: int, together: int) -> PyTree:
+def _by_xla(layout: Layout, outputs: Flat, width: int, together: int) -> PyTree:
     """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
@@ -203,13 +211,13 @@ def _by_xla(layout: Layout, width: int, together: int) -> PyTree:
 
         # One step with all measurements, and whether a filter finds one of them implausible.
         def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
-            after, outputs = network_step.judged(*layout.parts(row))
-            return jnp.concatenate([row_of(after), row_of(outputs)]), implausible(outputs)
+            after, known = network_step.judged(*layout.parts(row))
+            return jnp.concatenate([row_of(after), row_of(known)]), implausible(known)
 
         # The step again, for each filter without the measurements that it finds implausible.
         def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
             n = layout.state.size
-            first = layout.state.tree(stepped[:n]), layout.outputs.tree(stepped[n:])
+            first = layout.state.tree(stepped[:n]), outputs.tree(stepped[n:])
             return jnp.concatenate([row_of(leaf) for leaf in network_step.without(first, *layout.parts(row))])
 
         # The second step is taken only if a row of the turn needs it.
@@ -223,7 +231,7 @@ def _by_xla(layout: Layout, width: int, together: int) -> PyTree:
             )
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
 
-        columns = layout.state.size + layout.outputs.size
+        columns = layout.state.size + outputs.size
         stepped: jax.Array = jax.lax.fori_loop(0, turns, turn, jnp.zeros((width, columns)))
         return stepped
 

@@ -26,12 +26,14 @@ _kernel.multiple_results = True
 class _Kernel:
     """Arithmetic of one kernel and that of its derivatives; compared by identity."""
 
-    def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree], written: Callable[..., PyTree]):
-        # Traced once per shapes, however many filters use it.
+    def __init__(
+        self, function: Callable[..., PyTree], source: Callable[..., PyTree], written: Callable[..., PyTree] | None
+    ):
+        # Traced once per shapes, however many filters use it, for the shapes of results, for XLA and for native code.
         self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
         self.source = source
         self.sloped = jax.jit(partial(_sloped, source), static_argnums=(0, 1), inline=True)
-        self.written = jax.jit(lambda args, kwargs: written(*args, **kwargs))
+        self.written = self.function if written is None else jax.jit(lambda args, kwargs: written(*args, **kwargs))
 
     def __repr__(self) -> str:
         """Return the name of the arithmetic, by which the texts of two programs differ."""
@@ -58,7 +60,7 @@ def runs_last(
         written: the same arithmetic entry by entry, for native code; the kernel unless given.
     """
     source = kernel if differentiable_as is None else differentiable_as
-    this = _Kernel(kernel, source, kernel if written is None else written)
+    this = _Kernel(kernel, source, written)
 
     @wraps(kernel)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -97,9 +97,7 @@ def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     tree, function = params["tree"], params["kernel"].written
     key = (function, tree, kinds)
     if key not in lowering.kernels:
-        lowering.kernels[key] = jax.make_jaxpr(
-            lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
-        )(*(like(*kind) for kind in kinds))
+        lowering.kernels[key] = function.trace(*jax.tree.unflatten(tree, [like(*kind) for kind in kinds])).jaxpr
     return lowering.inline(lowering.kernels[key], inputs)
 
 
