@@ -44,7 +44,6 @@ def test_three_rooms_with_quantized_links(tmp_path):
     assert hg.simulation.StatisticsByName.open(tmp_path / "house.nc") == result
 
 
-@pytest.mark.slow
 def test_a_skewed_sensor_with_a_bias():
     """A level gauge whose errors are mostly small and sometimes large, always to one side, recorded on the bench; and a
     leak that nobody measures. I want level and leak, with honest bands, and better than the textbook filter."""

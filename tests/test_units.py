@@ -79,7 +79,6 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
     np.testing.assert_allclose(nothing.mean, means[0], rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_silent_component_is_as_if_it_were_not_there(name):
     received = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])

@@ -11,7 +11,6 @@ from heliograph.disk.quoting import FORMULA, from_cell, in_cell, in_figure, visi
 matplotlib.use("agg")
 
 
-@pytest.mark.slow
 @given(st.text())
 def test_a_cell_is_no_formula_and_can_be_read_again(text):
     cell = in_cell(text)

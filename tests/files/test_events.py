@@ -149,7 +149,6 @@ def test_columns_that_nobody_knows_or_that_lack_are_named(tmp_path, network):
         read_events(written(tmp_path / "b.csv", HEADER[:2], [row[:2] for row in ROWS]), network)
 
 
-@pytest.mark.slow
 def test_playing_gives_final_and_lagged_estimates(network):
     """Final ones are those of the rows in order; of each moment then what was received a lag later."""
     events = [Event(*row[:3], [float(cell or "nan") for cell in received(row)], row[3]) for row in ROWS]
@@ -171,7 +170,6 @@ def test_playing_gives_final_and_lagged_estimates(network):
     np.testing.assert_allclose(late.mean[0], alone.estimates["cart"]["f"].mean[0], rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_command_takes_events(tmp_path, capsys):
     (tmp_path / "net.py").write_text(NETWORK)
     data, out = written(tmp_path / "events.csv", HEADER, ROWS), tmp_path / "est.csv"

@@ -124,7 +124,6 @@ def test_an_input_may_not_be_called_time():
     refused(columns(pos=TIME), network({"a": ("pos",)}, inputs=("time",)), "input names", "'time'")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["data.csv", "data.parquet"])
 def test_a_recording_run_at_once_and_sample_by_sample(tmp_path, name):
     rng = np.random.default_rng(0)

@@ -74,7 +74,6 @@ def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
         assert received.value[0] == pytest.approx(2.0 - gain.moment(1) * mean, rel=ROUNDING)
 
 
-@pytest.mark.slow
 def test_a_step_computes_an_innovation_only_on_request():
     plant, sensor = hg.LinearPlant(0.9 * np.eye(2), 0.1, [1.0, 0.0], 1.0), hg.LinearSensor(np.eye(2), 0.1)
     item = hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2))

@@ -25,7 +25,6 @@ def test_two_sensors_with_shared_fading_or_in_two(shared, limit):
     assert variances(PLANT, two, links, STEPS)[-1, 0] == pytest.approx(limit, abs=6e-7)
 
 
-@pytest.mark.slow
 def test_two_drifting_hops():
     plant = hg.LinearPlant([[0.98, 0.1], [0, 0.95]], np.diag([0.002, 0.02]), [1.0, 0.0], np.diag([1.0, 0.2]))
     first, second = (hg.model.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9)))

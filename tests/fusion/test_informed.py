@@ -113,7 +113,6 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
         np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.slow
 def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
     groups = {"a": [0, 3], "b": [1, 2, 4]}
@@ -156,7 +155,6 @@ def test_losses_that_are_said_count_with_the_pattern_that_happened():
     np.testing.assert_allclose(fused["local matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_losses_at_random_keep_the_claim():
     """Each run has the covariances of its own losses: mean squares agree within three standard errors."""
     plant, parts = random_case(5)

@@ -85,7 +85,6 @@ def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, g
         assert here.amplitude[0] >= 1e-3 and here.number[0] == there.number[0]
 
 
-@pytest.mark.slow
 def test_an_amplitude_off_by_rounding_does_not_lose_the_receiver():
     """Where the receiver was compiled otherwise: it takes no decision by its amplitude, so rounding stays rounding."""
     rng = np.random.default_rng(0)
@@ -267,7 +266,6 @@ class _Optimist(hg.fusion.UniformQuantizer):
         return state, sent._replace(error=sent.error / 2)
 
 
-@pytest.mark.slow
 def test_the_check_finds_a_bound_that_does_not_hold():
     with pytest.raises(AssertionError, match="error: expected a bound, exceeded by"):
         check_quantizer(_Optimist(8, 3.0))

@@ -31,7 +31,6 @@ def test_any_feasible_point_is_a_dead_end():
     assert np.isfinite(design.gains[: design.failed_step]).all() and np.isnan(design.gains[design.failed_step :]).all()
 
 
-@pytest.mark.slow
 def test_a_level_too_low_says_where_it_fails_and_what_would_work():
     design = hg.h_infinity.recursive_design(node(0), 0.02)
     assert not design.feasible
@@ -42,7 +41,6 @@ def test_a_level_too_low_says_where_it_fails_and_what_would_work():
         hg.filters.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
 
 
-@pytest.mark.slow
 def test_the_initial_weight_alone_sets_the_smallest_level_of_the_paper():
     """(19), 10 I < gamma^2 15 I: sqrt(10/15); the solver's margin is 1e-6 of the level squared."""
     design = hg.h_infinity.recursive_design(node(2), 0.5, START)
@@ -70,7 +68,6 @@ def test_smallest_levels_over_the_horizon(i):
         assert hg.h_infinity.certify_level(node(i), item.gains, item.weights, item.multipliers, item.level).certified
 
 
-@pytest.mark.slow
 def test_the_recursion_cannot_look_ahead():
     result = hg.h_infinity.recursive_design(node(0))
     np.testing.assert_allclose(result.level, 0.02696, rtol=5e-4)
@@ -142,7 +139,6 @@ def test_without_feedthrough_a_gain_of_zero_is_optimal():
     np.testing.assert_allclose(hg.h_infinity.horizon_design(system).level, zero, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_no_division_where_a_link_always_delivers():
     for beta in ((1.0, 1.0, 1.0), (1.0, 0.75, 0.7), (0.8, 1.0, 1.0)):
         design = hg.h_infinity.horizon_design(node(0, beta=beta))

@@ -56,7 +56,6 @@ def oracle(values, z, form, inputs=INPUTS):
     return likelihood(model, z, inputs, form)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["linear", "conditional"])
 def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
     solution = next(single for single in result.solutions if single.form == form)
@@ -155,7 +154,6 @@ def chain():
     return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], 0.0), channel, {})})
 
 
-@pytest.mark.slow
 def test_a_ridge_is_said_before_the_data():
     """The route's mean gain and its noise, gain^2 0.2 + last noise, are two of three numbers."""
     before = hg.learning.identifiable(chain, INPUTS)
@@ -181,7 +179,6 @@ def test_recordings_that_cannot_be_learned_from(build, data, message):
         hg.fit(build, data, INPUTS)
 
 
-@pytest.mark.slow
 def test_a_value_of_a_noise_with_two_values_is_learned():
     """Its powers, 0 to 2, are moments of a noise that depends on what is searched for."""
 

@@ -41,7 +41,6 @@ def nees(item, seeds):
     return np.mean(values) / 2
 
 
-@pytest.mark.slow
 def test_numbers_learned_by_the_truth_give_a_claim_that_is_true_on_other_drives():
     """NEES of 20 drives of some 30 independent errors each: 1 to 6 % for what is drawn, 15 % for what is learned.
 

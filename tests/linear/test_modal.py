@@ -76,7 +76,6 @@ def test_a_relay_that_filters_in_the_fading_of_its_receiver():
     np.testing.assert_allclose(hg.linear.lmmse(system).gains.covariance, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_plant_that_changes_with_the_mode():
     """A mode of the plant that is received only through it, and other fading on the link."""
     plants = [

@@ -18,7 +18,6 @@ def errors(channel, degree, steps):
     return hg.linear.lmmse(hg.linear.lifted_system(PLANT, SENSOR, channel, degree, steps)).gains.covariance[:, 0, 0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("channel", [bursts(), TWO_HOPS])
 def test_degree_one_is_the_linear_filter(channel):
     np.testing.assert_allclose(errors(channel, 1, 30), variances(PLANT, SENSOR, channel, 30)[:, 0], rtol=1e-12)

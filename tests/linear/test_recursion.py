@@ -29,7 +29,6 @@ def test_scalar_recursion_by_hand():
     np.testing.assert_allclose(schedule.gains.gain[:, 0, 0], expected, rtol=1e-14)  # R = 1: the gain is P
 
 
-@pytest.mark.slow
 def test_slow_covariance_is_not_taken_for_its_limit():
     """a = 1 - 1e-5, begun 4e-10 above the limit: 100 steps change 8e-13 of it, and 5000 steps fifty times as much."""
     a, r, horizon = 1 - 1e-5, 1e6, 5000

@@ -42,7 +42,6 @@ def test_absurd_events_leave_no_trace(make):
     same(result.estimates, expected.estimates)
 
 
-@pytest.mark.slow
 def test_one_filter_alone_leaves_out_what_only_it_finds_implausible():
     """It believes noise of 1e-16: 1 is 1e8 of its deviations. The others use it, and it goes on with what it knew."""
     sure = hg.LinearSensor([[1.0]], 1e-16)

@@ -30,7 +30,6 @@ def test_steps_are_silent_once_the_watermark_has_passed_them():
     assert abs(line.estimates()["a"]["f"].mean[0] - before.mean[0]) > 0.3
 
 
-@pytest.mark.slow
 def test_the_timeline_is_the_filter_on_all_steps_with_their_silences():
     line, rows = hg.Timeline(network(), window=0), [0.2, np.nan, np.nan, 1.0, np.nan, np.nan]
     for k, value in enumerate(rows):
@@ -45,7 +44,6 @@ def test_the_timeline_is_the_filter_on_all_steps_with_their_silences():
     np.testing.assert_allclose(result.covariance, last.covariance, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_sender_that_misses_its_heartbeat_is_dead_not_constant():
     line = hg.Timeline(network(hg.perfect()), window=0)
     line.push("a", 0, 0.0, [0.2])
@@ -80,7 +78,6 @@ def chain(channel):
     return result
 
 
-@pytest.mark.slow
 def test_a_stream_says_which_steps_are_silent_and_whether_its_sender_is_dead():
     stream = hg.Stream(network(hg.perfect()).nodes["a"].filters["f"])
     for value in (0.2, np.nan, 1.0, np.nan, np.nan, np.nan, np.nan):

@@ -67,7 +67,6 @@ def result() -> dict[str, dict[str, hg.Statistics]]:
     return hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 3, keep=hg.Statistics(), inputs=INPUTS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plain", "trajectory", "relay", "bursts"])
 def test_claims_are_exact(result: dict[str, dict[str, hg.Statistics]], name: str) -> None:
     s = result[name]["linear"]

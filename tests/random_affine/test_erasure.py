@@ -32,7 +32,6 @@ def test_certain_loss_and_certain_arrival(arrival, lost):
     assert np.isnan(received(hg.erasure(hg.perfect(), arrival), [1.0])).mean() == lost
 
 
-@pytest.mark.slow
 def test_a_relay_forwards_what_was_lost_as_lost():
     chain = hg.amplify_and_forward([hg.hop(1.0, 0.0), hg.erasure(hg.hop(2.0, 0.0), 0.8), hg.hop(3.0, 0.0)])
     z = received(chain, [1.0])

@@ -62,7 +62,6 @@ def test_the_best_receiver_behind_given_relays(local):
     assert relative(long.gains.covariance[-2:], behind) < 1e-9
 
 
-@pytest.mark.slow
 def test_without_relays_it_is_the_linear_filter():
     full = example()
     direct = full.slots[1]["relay_1"]["sensor"]
@@ -120,7 +119,6 @@ def test_relays_that_receive_only_each_other_learn_nothing():
         np.testing.assert_allclose(design.covariance[name][-1], still.covariance["receiver"][-1], rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_a_periodic_design_is_no_schedule_from_the_start(local):
     """Its covariances are those after long, not those of the first period."""
     net = example()

@@ -69,7 +69,6 @@ def test_bad_gains_are_refused():
         receiver_behind_relays(example(), {"relay_1": np.zeros((4, 3, 1)), "relay_2": np.zeros((4, 3, 2))})
 
 
-@pytest.mark.slow
 def test_it_runs_as_a_filter():
     schedule = receiver_behind_relays(example(), local_error_design(example(), 3).gains)
     filter_ = ScheduledFilter(schedule)

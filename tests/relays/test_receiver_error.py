@@ -29,7 +29,6 @@ def ratio(design, local):
     return design.trace("receiver")[1:] / local.trace("receiver")[1:]
 
 
-@pytest.mark.slow
 def test_tuned_together_the_receiver_errs_less(local):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
     assert np.mean(ratio(tuned, local)) <= 0.775  # found: 0.7680
@@ -66,7 +65,6 @@ def test_a_limit_that_does_not_bind_costs_nothing(greedy, free):
     np.testing.assert_allclose(*costs, rtol=1e-4)  # what the last barrier may leave
 
 
-@pytest.mark.slow
 def test_a_limit_just_above_the_power_of_the_mean_is_met(greedy):
     """Nearly all that three relays, one silent in each slot, may send is the mean, which says nothing."""
     net = unusual()
@@ -107,7 +105,6 @@ def test_limits_that_can_not_be_met_are_refused(local):
         receiver_error_design(example(), HORIZON, weights=-np.ones(HORIZON))
 
 
-@pytest.mark.slow
 def test_one_step_ahead_greedy_is_best_for_the_receiver(greedy):
     """With all weight on the last step, that step's receiver gain is the greedy one for the moments it meets."""
     net, weights = unusual(), np.eye(STEPS)[-1]

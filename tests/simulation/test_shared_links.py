@@ -55,7 +55,6 @@ def test_one_object_twice_in_a_channel_is_two_links():
     np.testing.assert_array_equal(z["together"][..., 0], z["together"][..., 1])
 
 
-@pytest.mark.slow
 def test_a_central_filter_believes_what_the_world_does():
     """Two nodes with one link object and a centre with `parallel` of both: its exact claim holds."""
     link = hg.gilbert_elliott(hg.hop(1.0, 0.05), hg.hop(0.2, 0.05), 0.2, 0.3)

@@ -84,7 +84,6 @@ def leaves(record):
     return [record.truth, *record.measurements.values(), *jax.tree.leaves(record.estimates)]
 
 
-@pytest.mark.slow
 def test_shapes_and_order(record):
     assert record.truth.shape == (RUNS, HORIZON, 2)
     assert list(record.measurements) == ["b", "a", "direct", "silence"]
@@ -143,7 +142,6 @@ def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
                 np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_true_channel_makes_the_data_and_the_filter_believes_another(statistics):
     (observation, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
     assert observation < deaf - 4 * np.hypot(error, other)
@@ -232,7 +230,6 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
         np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
-@pytest.mark.slow
 def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
     result = statistics["fused"]["over time"]

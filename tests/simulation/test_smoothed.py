@@ -45,7 +45,6 @@ def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
                 np.testing.assert_allclose(known.covariance[run], alone.covariance, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
 def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     result = record.smoothed.estimates
     parts = [result[node]["linear"] for node in GAPS.names]
@@ -55,7 +54,6 @@ def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     assert np.all(np.trace(fused.covariance, axis1=2, axis2=3)[:, :-1] < 0.5)  # of about 1 without measurements
 
 
-@pytest.mark.slow
 def test_saving_says_what_has_to_be_saved_apart(record, tmp_path):
     with pytest.warns(UserWarning, match="without `smoothed`, which is saved apart"):
         record.save(tmp_path / "all.nc")

@@ -27,7 +27,6 @@ def test_a_central_filter_without_random_gains_smooths_as_one_that_receives_all_
 REMEMBERING = {"uncertain chain": (0.02, hg.linear_filter), "multiple models": (0.0, hg.filters.imm_filter)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", REMEMBERING)
 def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(kind):
     radius, make = REMEMBERING[kind]

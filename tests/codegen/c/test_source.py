@@ -124,7 +124,6 @@ def test_it_computes_what_the_function_does(function, tmp_path):
     np.testing.assert_allclose(result, right, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("function", [arithmetic, functions, guarded, looked_up])
 def test_in_single_precision(function, tmp_path):

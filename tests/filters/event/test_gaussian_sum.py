@@ -69,7 +69,6 @@ def test_the_posterior_of_silence_has_no_more_covariance_than_silence_skipped():
     assert np.all(variance <= skipped * (1 + 1e-4))  # 1e-4: the grid
 
 
-@pytest.mark.slow
 def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     trigger = hg.SendOnDelta(5.0, heartbeat=1)
     z, _ = simulated(LOSSY, trigger, 40)
@@ -79,7 +78,6 @@ def test_a_heartbeat_at_each_step_is_the_kalman_filter():
     np.testing.assert_allclose(result.covariance, kalman.covariance, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_delta_near_zero_is_the_kalman_filter_with_erasures():
     trigger = hg.SendOnDelta(1e-5)
     z, _ = simulated(LOSSY, trigger, 60)
@@ -177,7 +175,6 @@ def test_every_rule_gives_a_filter_of_the_contract(trigger, sizes):
     check_filter(item)
 
 
-@pytest.mark.slow
 def test_later_data_and_silence_improve_earlier_estimates():
     """Rauch, Tung and Striebel's sweep on the joined moments: nominal, NEES up to 1.34 with losses that are unknown."""
     trigger = hg.SendOnDelta(0.6)

@@ -83,7 +83,6 @@ def test_what_depends_on_data_stays_as_it_is():
         assert item.planned(np.zeros((3, 0))) is item
 
 
-@pytest.mark.slow
 def test_it_is_made_inside_a_compiled_function_for_nodes_side_by_side():
     items = [hg.linear_filter(PLANT, SENSOR, hg.hop(hg.Rayleigh(s), 0.1, dimension=2)) for s in (0.5, 1.0)]
     inputs, z = np.ones((STEPS, 1)), np.array([0.3, -0.2])

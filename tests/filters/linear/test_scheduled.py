@@ -38,7 +38,6 @@ def test_estimates_are_the_papers():
         np.testing.assert_allclose(bounds, expected.true[1:, :n, :n], rtol=0, atol=1e-11 * scale)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_saved_gains_are_the_recursion(degree):
     s, data = model(EXAMPLE, HORIZON), measurements(1)
@@ -54,7 +53,6 @@ def single(s, keep):
     return s._replace(channel=hg.random_affine.Series([s.channel, hg.random_affine.known(row)]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_missing_component_is_a_channel_that_is_off(missing):
     """Every monomial with the component in it goes; what is left is the filter of the other component alone."""
@@ -81,7 +79,6 @@ def test_nothing_arrives_for_a_while():
     np.testing.assert_allclose(bounds, expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
 def test_saved_gains_tell_that_their_covariance_is_lost():
     s, data = model(EXAMPLE, HORIZON), measurements(1)
     data[4] = np.nan
@@ -145,7 +142,6 @@ def test_uncertain_probabilities_make_the_claim_nominal():
         )
 
 
-@pytest.mark.slow
 def test_claims_hold_in_the_drivers_monte_carlo():
     """Exact claims of every degree and of memory, in one network on one data set: NEES and covariances."""
     horizon, s = 10, model(EXAMPLE, 10, initial=0.01 * np.eye(2))

@@ -201,7 +201,6 @@ def record():
     return hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, filters)}), 160, 512, 0)
 
 
-@pytest.mark.slow
 def test_what_is_merged_early_is_worse_and_claims_too_little(record):
     """The example's figures, 512 runs of 160 steps: claims within 4 % (they vary by run), errors in their order."""
     names = [build.__name__ for build in FILTERS]
@@ -238,7 +237,6 @@ def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
 
 
-@pytest.mark.slow
 def test_a_mode_that_losses_show_is_known():
     """Everything lost in one mode, nothing in the other: the Kalman filter that skips, whatever the chain."""
     links = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.erasure(hg.hop(0.8, 0.1), 0.0), 0.2, 0.4)
@@ -283,7 +281,6 @@ def test_a_count_of_particles_is_positive():
         hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=0)
 
 
-@pytest.mark.slow
 def test_particles_depend_on_seed_and_data_alone(estimated):
     once, again = estimated[0], stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE), DATA)[0]
     np.testing.assert_array_equal(once.mean, again.mean)

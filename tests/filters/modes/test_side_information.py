@@ -23,7 +23,6 @@ def claims(item, data):
     return np.column_stack([steps.mean[:, 0], steps.covariance[:, 0, 0]])
 
 
-@pytest.mark.slow
 def test_arrival_that_is_certain_tells_nothing():
     certain = hg.markov_fading([hg.erasure(hg.hop(g, 0.05), 1.0) for g in (0.2, 1.0)], BURSTS)
     expected = claims(hg.linear_filter(PLANT, SENSOR, bursts()), Z)
@@ -47,7 +46,6 @@ def test_flags_that_show_the_mode_make_it_the_kalman_filter_given_the_modes():
     np.testing.assert_allclose(known, expected, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_state_far_from_zero_keeps_its_digits():
     """Where modes differ in their losses alone, a mean of 1e8 deviations moves the estimate and no covariance."""
     channel = hg.markov_fading([hg.erasure(hg.hop(0.7, 0.05), a) for a in ARRIVAL], BURSTS)
@@ -69,7 +67,6 @@ def test_a_state_that_is_known_stays_known():
     np.testing.assert_allclose(result[:, 0], 42.1271 * (-1.1468) ** np.arange(1, 9), rtol=1e-14)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [1e-8, 1e-14, 1e-20])
 def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
     """Of x received in noise far below its own: the variance is the noise's, where a difference would be rounding."""
@@ -183,7 +180,6 @@ def test_claims_hold_in_simulation(record):
         assert known is None or claimed.mean() == pytest.approx(known, abs=spread), name
 
 
-@pytest.mark.slow
 def test_arrival_that_varies_and_is_certain_at_some_steps():
     """At a step where everything arrives, a packet lost for another reason tells nothing of the mode."""
     chain = hg.random_affine.MarkovChain(BURSTS)

@@ -78,7 +78,6 @@ def resting():
     return at_the_end(world, *listening(0.0, (1.0, 0.1))[1:])
 
 
-@pytest.mark.slow
 def test_against_a_true_clock_and_in_motion_both_are_found(moving):
     """Published from another simulation, taken to be of 500 runs: within three standard errors of the difference."""
     share = 3 * np.sqrt(1 / (2 * RUNS) + 1 / 1000)  # of a deviation; twice that of its square
@@ -92,7 +91,6 @@ def test_against_a_true_clock_and_in_motion_both_are_found(moving):
     assert nees(moving["guarded"], slice(0, 2)) == pytest.approx(1.0, rel=3 / np.sqrt(RUNS))
 
 
-@pytest.mark.slow
 def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     """As known exactly; the published .54 and 21 are of one simulation, whose squares have a deviation of 1/7."""
     errors, _ = moving["ignored"]
@@ -106,7 +104,6 @@ def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trap", "filters"), [("resting", ""), ("moving", ", alone")], ids=["at rest", "no true clock"]
 )

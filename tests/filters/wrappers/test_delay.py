@@ -96,7 +96,6 @@ def claimed(a, c, r, q, weights, gains, noise):
 numbers = st.floats(-1.0, 1.0)
 
 
-@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(numbers, min_size=4, max_size=4), st.lists(numbers, min_size=2, max_size=2), st.integers(0, 2**32 - 1))
 def test_unknown_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
@@ -124,7 +123,6 @@ def check_that_it_is_the_best(a, c, r, q, weights, gains, noise):
     np.testing.assert_allclose(result, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
 
 
-@pytest.mark.slow
 def test_delays_that_are_a_chain():
     rows, initial = np.array([[0.8, 0.2, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 0.7]]), np.array([0.5, 0.3, 0.2])
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), N, delay=hg.random_affine.MarkovChain(rows, initial))
@@ -198,7 +196,6 @@ def simulated(filters):
     return network, hg.monte_carlo(network, STEPS, 1024, key=0)
 
 
-@pytest.mark.slow
 def test_simulated_errors_are_as_known_before(simulated):
     _, record = simulated
     errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, estimate in record.estimates.items() for f in estimate}

@@ -55,14 +55,12 @@ def test_errors_given_a_pattern_are_those_of_the_stacked_problem(lossy, name, we
     assert errors.claim == "exact"
 
 
-@pytest.mark.slow
 def test_an_intersection_claims_at_least_its_error_for_every_pattern(lossy):
     for seed, name in product(range(3), ("equal", "trace")):
         errors = hg.simulation.mesh_errors(lossy, name, arrivals(lossy, name, 30, seed))
         assert np.linalg.eigvalsh(errors.claimed - errors.actual).min() > -1e-12
 
 
-@pytest.mark.slow
 def test_best_weights_are_no_worse_than_any_other_of_one_step(lossy):
     arrived = arrivals(lossy, "best", 2, 1)
     result = {name: hg.simulation.mesh_errors(lossy, name, arrived).mean_trace() for name in RULES}
@@ -112,7 +110,6 @@ def available(arrived):
     return known
 
 
-@pytest.mark.slow
 def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy):
     steps = 5
     arrived = arrivals(lossy, "trace", steps, 2)
@@ -138,7 +135,6 @@ def test_the_bound_is_the_best_linear_estimate_from_all_that_can_be_there(lossy)
         assert bound[i] == pytest.approx(least, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_no_rule_beats_the_bound(lossy):
     arrived = arrivals(lossy, "best", 12, 5)
     bound = hg.simulation.best_possible(lossy, "best", arrived)
@@ -229,7 +225,6 @@ def test_frozen_weights_that_are_computed_ahead_are_those_of_a_run(monkeypatch):
             assert ours.covariance == pytest.approx(np.asarray(theirs.covariance[0]), rel=1e-10)
 
 
-@pytest.mark.slow
 def test_a_one_way_ring_is_not_starved():
     """Two nodes of opposite sides know a state each: a share by trace alone follows the one that is nearer."""
     names = [f"n{i:02}" for i in range(12)]

@@ -28,7 +28,6 @@ def record(lossy):
     return hg.monte_carlo(lossy, STEPS, RUNS, 4)
 
 
-@pytest.mark.slow
 def test_every_node_has_an_estimate_with_its_claim(lossy, record):
     assert {name: claim for name, claim in lossy.claims()["b"].items()} == {
         "best": "exact", "trace": "upper", "diffusion": "exact"
@@ -78,7 +77,6 @@ def statistics():
     return hg.monte_carlo(network(rules, link=BURSTS), 40, 960, 1, hg.Statistics())
 
 
-@pytest.mark.slow
 def test_statistics_have_each_node(statistics):
     assert statistics["b"]["trace"].claim == "upper"
     assert statistics["b"]["trace"].runs == 960 and np.isfinite(statistics["b"]["trace"].rmse()[0])
@@ -128,7 +126,6 @@ def test_a_timeline_has_every_node_where_no_message_gets_lost():
     assert timeline.estimates()["b"]["trace"].mean == pytest.approx(np.asarray(expected.mean)[-1], rel=1e-9)
 
 
-@pytest.mark.slow
 def test_a_service_has_every_node_where_no_message_gets_lost():
     whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
     z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}

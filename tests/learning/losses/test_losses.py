@@ -72,7 +72,6 @@ def test_it_finds_the_modes_it_was_drawn_from(learned):
         assert result[name].high - result[name].low < 0.4 * np.sqrt(truth)  # 4,000 packets tell something
 
 
-@pytest.mark.slow
 def test_the_profile_falls_by_half_the_chi_square_point_at_the_ends_of_an_interval(learned, bursts):
     """Where one share stands at an end of its interval and the others are the likeliest ones."""
     runs, shares = Runs.of([bursts]), learned.laws["hidden"].shares()

@@ -91,7 +91,6 @@ def first_step(measured):
     return type(measured)(*(None if part is None else part[0] for part in measured))
 
 
-@pytest.mark.slow
 def test_the_error_is_that_of_the_recursion(problem):
     name, item = problem
     result = item.at(item.numbers.start).covariances[0]
@@ -132,7 +131,6 @@ def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     assert mean <= p + q <= 1.05 * mean
 
 
-@pytest.mark.slow
 def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     result = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
@@ -156,7 +154,6 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     assert result.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
-@pytest.mark.slow
 def test_a_relay_is_placed_where_the_closed_form_puts_it():
     """One state, two hops, loss d^-3: above rho = 4 the best site leaves the middle, x (1 - x) = 1 / rho."""
     rho = 8.0

@@ -42,7 +42,6 @@ def test_gradients_of_every_error_are_those_of_differences(build, free, error):
     check_gradients(NumberProblem(build, as_numbers(free), error))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free", "options"),
     [

@@ -56,7 +56,6 @@ def test_a_table_knows_what_the_law_knows():
     assert all(table.moment(a) == law.moment(a) for k in range(5) for a in exponents(2, k))
 
 
-@pytest.mark.slow
 def test_a_large_order_needs_no_large_matrix():
     """16 states, order 4: the vector has 4845 entries; the matrix that is not formed has 23 million."""
     plant = hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), 0.5 * np.eye(16), 0.3)

@@ -118,7 +118,6 @@ class Counted(hg.random_affine.AbstractNoise):
         return {1: 0.0, 2: self.rate, 3: self.rate}[powers[0]]
 
 
-@pytest.mark.slow
 def test_a_noise_of_counts_is_simulated():
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     sensor = hg.LinearSensor([[1.0]], Counted(4.0))

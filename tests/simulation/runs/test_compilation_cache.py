@@ -92,7 +92,6 @@ def test_no_home_folder_is_one_line(monkeypatch):
         hg.simulation.keep_compilations()
 
 
-@pytest.mark.slow
 def test_import_is_lazy_and_changes_no_configuration():
     program = (
         "import sys, heliograph; assert 'jax' not in sys.modules; heliograph.Network; import jax, os; "

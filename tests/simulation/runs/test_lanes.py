@@ -86,7 +86,6 @@ def test_single_precision_tells_the_same_story():
     assert (double.claim, single.claim) == ("exact", "nominal")  # nobody counts the digits that it loses
 
 
-@pytest.mark.slow
 def test_single_precision_error_of_a_filter_on_the_same_data():
     """Rounding to 24 bits, amplified by a few steps: below 1e-5 of the estimates' size."""
     item = network().nodes["a"].filters["f"]
@@ -104,7 +103,6 @@ def test_single_precision_error_of_a_filter_on_the_same_data():
     np.testing.assert_allclose(single.covariance, double.covariance, atol=1e-5 * np.abs(double.covariance).max())
 
 
-@pytest.mark.slow
 def test_what_single_precision_takes_for_none_is_said():
     """Variances below 1.2e-38, as of states in units of 1e20: claims would be 0."""
     plant, sensor = hg.LinearPlant([[0.9]], 1e-39, [0.0], 1e-36), hg.LinearSensor([[1.0]], 1e-36)

@@ -183,7 +183,6 @@ def code(network: hg.Network, seed: int = 0):
         return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories(), 8)
 
 
-@pytest.mark.slow
 def test_many_nodes_are_what_each_is_alone(monkeypatch):
     """A few at a time: each node's numbers are those of a network of its own."""
     monkeypatch.setenv(SETTING, "native")
@@ -224,7 +223,6 @@ class Largest(AbstractReducer):
         return carry, collected.max(axis=1)
 
 
-@pytest.mark.slow
 def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
     network, results = shadowed(), {}
     for engine in ("native", "xla"):
@@ -235,7 +233,6 @@ def test_a_reducer_of_ones_own_is_computed_by_both_engines(monkeypatch):
     assert [len(part) for part in results["xla"]] == [3, 35]
 
 
-@pytest.mark.slow
 def test_keys_of_another_hash_are_simulated_by_xla():
     network = hg.Network(ALONE, {"a": hg.Node(GAIN, link(), {})})
     record = hg.monte_carlo(network, 3, 2, jax.random.key(0, impl="rbg"))
