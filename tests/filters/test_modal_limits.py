@@ -100,7 +100,6 @@ def test_a_mean_far_from_zero_costs_no_digits(radius):
     np.testing.assert_allclose(results[1][2], results[0][2], rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_it_keeps_the_contract_of_filters():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))

@@ -43,7 +43,6 @@ def of_problems(count):
     return decorated
 
 
-@pytest.mark.slow
 @of_problems(6)
 def test_equal_rows_are_no_memory(seed, plant, sensor, maps, rows, law):
     """Against the mixture of the maps, which the filter of links that forget receives."""

@@ -66,7 +66,6 @@ def test_a_matrix_that_does_not_fit_is_named():
         hg.state_space(np.eye(2), [[1.0]], 1.0, 1.0, [0.0, 0.0], 1.0)
 
 
-@pytest.mark.slow
 def test_likelihoods_are_differentiated_through_the_same_scan():
     def value(q):
         plant, sensor = hg.state_space([[0.9]], [[1.0]], q, 1.0, [0.0], 1.0)

@@ -49,7 +49,6 @@ def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     assert set(net.claims()["fused"].values()) == {"exact"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""

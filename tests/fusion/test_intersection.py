@@ -29,7 +29,6 @@ def certified(information):
     return weights, relative_gap(information, weights)
 
 
-@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), shape=st.sampled_from([(2, 2), (4, 1), (6, 5)]))
 def test_the_gap_of_the_weights_is_certified(seed, shape):

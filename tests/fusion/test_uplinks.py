@@ -73,7 +73,6 @@ def stacked(arrives):
     return x @ start @ x.T - cross @ np.linalg.solve(reports @ start @ reports.T + white, cross.T)
 
 
-@pytest.mark.slow
 def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     """Every pattern of one recording of zeros: 1e-9 of the stacked problem; what is still on its way counts not."""
     draw = np.random.default_rng(0)
@@ -88,7 +87,6 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     np.testing.assert_allclose(result.covariance[-1], stacked(arrives), rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_every_second_step_sends(record):
     for report in record.reports["second"].values():
         values = np.asarray(report.values)

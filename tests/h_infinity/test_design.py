@@ -111,7 +111,6 @@ def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
     np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
 
 
-@pytest.mark.slow
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
     third, short = node(2, steps=2), node(0, steps=2)
@@ -122,7 +121,6 @@ def test_a_second_solver_finds_the_same_level():
     assert hg.h_infinity.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
 
 
-@pytest.mark.slow
 def test_without_measurements_the_channel_plays_no_part():
     closed = level_without_measurements(node(0))
     np.testing.assert_allclose(closed, 0.029031, rtol=3e-5)

@@ -85,7 +85,6 @@ def test_values_beyond_limits_count_as_not_arrived():
     np.testing.assert_allclose(last, record_.estimates["a"]["f"].mean[-1], atol=1e-14)  # two programs
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [None, hg.smoothing.FixedInterval()])
 def test_absurd_rows_of_a_recording_leave_no_trace(smooth):
     item, other = hg.linear_filter(PLANT, SENSOR, FADING), hg.cubature_filter(PLANT, SENSOR, FADING)

@@ -16,7 +16,6 @@ def network(channel=LOSSY, heartbeat=5):
     return hg.Network(PLANT, {"a": hg.Node(SENSOR, channel, {"f": item}, trigger=trigger)})
 
 
-@pytest.mark.slow
 def test_steps_are_silent_once_the_watermark_has_passed_them():
     line = hg.Timeline(network(), window=3)
     line.push("a", 0, 0.0, [0.2])

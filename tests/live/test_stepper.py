@@ -151,7 +151,6 @@ def test_limits_are_counted_by_both_engines(monkeypatch):
             stream.push([np.inf, 1.0], [0.0])
 
 
-@pytest.mark.slow
 def test_a_filter_that_native_code_does_not_take_is_stepped_by_xla(monkeypatch):
     """One of a plant with an incomplete beta function; by native code alone it is refused in one line."""
     plant = hg.Plant(

@@ -181,7 +181,6 @@ def test_noises_and_moments_of_every_map_can_be_traced():
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     """The worst cases over a known polytope are functions of the hop's power; the decisions on the way are the same."""
 

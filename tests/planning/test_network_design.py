@@ -130,7 +130,6 @@ def test_one_node_with_parallel_chains_is_the_same(single):
     assert list(result.powers)[1] == "all.part2.hop1"
 
 
-@pytest.mark.slow
 def test_the_designed_network_claims_the_designed_error(single):
     result = hg.design(single, budget=10)
     steady = steady_covariance(result.network.fused["best"])

@@ -53,7 +53,6 @@ def test_it_is_the_best_linear_function_of_everything_received():
     assert relative(result, best_from_all_measurements(p, gains)) < 1e-9  # of the batch solve
 
 
-@pytest.mark.slow
 def test_it_is_at_least_as_good_as_the_greedy_receiver():
     for net, horizon in ((example(), 100), (unusual(), 9)):
         design = local_error_design(net, horizon)

@@ -103,7 +103,6 @@ def test_a_record_comes_back_from_arrays_tables_and_pickles(record):
     assert identical(pickle.loads(pickle.dumps(record)), record) and identical(copy.deepcopy(record), record)
 
 
-@pytest.mark.slow
 @settings(max_examples=8, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(record=records(), ending=st.sampled_from([".nc", ".nc", ".zarr"]))
 def test_a_record_comes_back_from_a_file(record, ending, tmp_path):

@@ -172,7 +172,6 @@ def test_several_components_are_filtered_and_claimed_rightly(channel, trigger):
     assert nees == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "channel",
     [

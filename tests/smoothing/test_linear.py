@@ -37,7 +37,6 @@ def problem(seed):
     return item, stacked(mean, covariance, steps), z
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_smoothers_are_the_stacked_linear_estimate(seed):
     item, whole, z = problem(seed)

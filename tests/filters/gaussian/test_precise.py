@@ -192,7 +192,6 @@ def test_an_output_that_says_what_others_said_is_left_out():
     assert np.all(np.abs(squared.mean(axis=0) - claimed) < 6 * deviation)
 
 
-@pytest.mark.slow
 def test_more_precise_outputs_than_are_unrolled():
     """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
     h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
@@ -254,7 +253,6 @@ def test_a_combination_free_of_noise_is_known(noise, combined):
             assert np.abs(record.errors("a", name)).max() < 1e-14
 
 
-@pytest.mark.slow
 def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
     """d P+ / d N at N = 0 of a combination without noise, against a difference of second order in 1e-5: 1e-4."""
     plant = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0)

@@ -57,7 +57,6 @@ def test_two_hops_that_drift():
     np.testing.assert_allclose(result.ratio[-1], np.diag(result.true[-1]) / np.diag(result.claimed[-1]))
 
 
-@pytest.mark.slow
 def test_a_filter_for_two_fadings_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     apart, together = (hg.parallel([link] * 2) for link in (bursts(), hg.shared(bursts(), "road")))

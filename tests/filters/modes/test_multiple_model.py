@@ -288,7 +288,6 @@ def test_particles_depend_on_seed_and_data_alone(estimated):
     assert other.mean[0] != once.mean[0]
 
 
-@pytest.mark.slow
 def test_particles_are_the_same_in_a_simulation_a_recording_and_a_stream(record):
     item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, {"particles": item})})

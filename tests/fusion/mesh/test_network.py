@@ -113,7 +113,6 @@ def test_a_link_for_each_edge(lossy):
     assert arrived[:, 0, 0, 1].mean() == pytest.approx(0.7, abs=0.08)
 
 
-@pytest.mark.slow
 def test_a_timeline_has_every_node_where_no_message_gets_lost():
     whole, generator = network({"trace": RULES["trace"]}), np.random.default_rng(3)
     z = {name: generator.standard_normal((3, node.received)) for name, node in whole.nodes.items()}

@@ -73,7 +73,6 @@ def test_several_devices_share_the_lanes(tmp_path):
     np.testing.assert_allclose(result["outer"], statistics.outer, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_single_precision_tells_the_same_story():
     """Other draws of the same laws: RMSE within 4 standard errors of its difference over 8,192 runs."""
     double, single = (
