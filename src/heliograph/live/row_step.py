@@ -127,7 +127,7 @@ class RowStep:
         self._like = tuple(like(leaf.shape, leaf.dtype) for leaf in numbers)
         self.state = flat_like(start)
         self._layout = Layout(static, self.state, received, inputs)
-        self.outputs = _outputs(self._layout, self._like)
+        self.outputs = flat_like(_traced(self._layout, self._like).out_info[1])
         self.start = np.concatenate([np.zeros(0), *(np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(start))])
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
@@ -185,13 +185,8 @@ def _in_rows(layout: Layout) -> Any:
     return step
 
 
-@lru_cache
-def _outputs(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Flat:
-    """Return the layout of a step's outputs, once for networks that differ in numbers alone."""
-    return flat_like(_traced(layout, numbers).out_info[1])
-
-
 def _traced(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
+    """Return the traced step of a row, which JAX holds for networks that differ in numbers alone."""
     with jax.enable_x64(True):
         return _stepped(layout).trace(list(numbers), like((layout.size,), np.float64))
 
