@@ -53,7 +53,7 @@ clean:  ## Remove the environment and everything made by the other targets
 # An interpreter of some years comes with a pip that takes half as long again.
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
-	  { echo "heliograph needs Python 3.11 or newer and '$(PYTHON)' is not: try make PYTHON=python3.12" >&2; exit 1; }
+	  { echo "heliograph needs Python 3.11 or newer, and '$(PYTHON)' is older or does not start: try make PYTHON=python3.12" >&2; exit 1; }
 	@$(PYTHON) -m venv --clear .venv >/dev/null 2>&1 || \
 	  { echo "'$(PYTHON) -m venv .venv' failed: install venv and pip for it (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
 	@$(BIN)/python $(INSTALL) --upgrade pip || true
