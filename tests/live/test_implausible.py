@@ -1,9 +1,13 @@
 """A timeline that absurd events come to is, bit for bit, one that they never came to; so is a recording."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.simulation.judging import plausible_step
+from heliograph.simulation.stepping import AllFilters
 from tests.live.worlds import FADING, PLANT, SENSOR, events, forgetful, moving
 
 ABSURD = [1e16, -1e20, 3.4e38, 1e155, -1e308]
@@ -113,3 +117,15 @@ def test_absurd_inputs_of_a_recording_are_named():
     u[2] = 1e200
     with pytest.warns(UserWarning, match="inputs: row 3 is implausible: with it the mean loses its digits"):
         hg.run(network, {"a": np.full((6, 1), np.nan)}, u)
+
+
+def test_the_step_without_implausible_data_is_the_same_code_as_that_with_all():
+    plant = hg.Plant(lambda x, u: jnp.arctan(x), 0.1, [0.0], 1.0)
+    sensor = hg.Sensor(jnp.arctan, 0.1)
+    node = hg.Node(sensor, hg.perfect(), {"extended": hg.extended_filter(plant, sensor)})
+    network = hg.Network(plant, {"a": node})
+    filters = AllFilters(network, judges=True)
+    arguments = filters, filters.init(), [jnp.zeros((1, 1))], jnp.zeros(0), jnp.asarray(0)
+    texts = [str(eqx.filter_make_jaxpr(step)(*arguments)[0]) for step in (AllFilters.step, plausible_step)]
+    written = [text.count(" atan ") for text in texts]
+    assert written[0] == written[1] > 0, written

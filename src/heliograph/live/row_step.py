@@ -15,7 +15,7 @@ from heliograph.live.static import Static, cast
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.judging import implausible, plausible_step, step_with_all, step_without
+from heliograph.simulation.judging import plausible_step
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
@@ -75,18 +75,6 @@ class NetworkStep(Module):
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
         after, outputs = plausible_step(self.filters, state, self.groups(received), u, k)
-        return after, {name: outputs[name] for name in OUTPUTS}
-
-    def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """Step all filters with every measurement, implausible or not."""
-        after, outputs = step_with_all(self.filters, state, self.groups(received), u, k)
-        return after, {name: outputs[name] for name in OUTPUTS}
-
-    def without(
-        self, first: tuple[PyTree, PyTree], state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, PyTree]:
-        """Repeat the step, each filter without the measurements that it finds implausible."""
-        after, outputs = step_without(self.filters, first, state, self.groups(received), u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
     def groups(self, received: jax.Array) -> list[jax.Array]:
@@ -200,30 +188,12 @@ def _text(layout: Layout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
 @lru_cache
 def _by_xla(layout: Layout, outputs: Flat, width: int, together: int) -> PyTree:
     """Compile (numbers, rows, turns) to rows as a loop over rows side by side, so that results depend on no turns."""
+    step = _in_rows(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        network_step: NetworkStep = layout.static.filled(numbers)
-
-        # One step with all measurements, and whether a filter finds one of them implausible.
-        def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
-            after, known = network_step.judged(*layout.parts(row))
-            return jnp.concatenate([row_of(after), row_of(known)]), implausible(known)
-
-        # The step again, for each filter without the measurements that it finds implausible.
-        def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
-            n = layout.state.size
-            first = layout.state.tree(stepped[:n]), outputs.tree(stepped[n:])
-            return jnp.concatenate([row_of(leaf) for leaf in network_step.without(first, *layout.parts(row))])
-
-        # The second step is taken only if a row of the turn needs it.
         def turn(i: jax.Array, done: jax.Array) -> jax.Array:
             some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
-            stepped, bad = jax.vmap(judged)(some)
-            stepped = jax.lax.cond(
-                jnp.any(bad),
-                lambda: jnp.where(bad[:, None], jax.vmap(without)(some, stepped), stepped),
-                lambda: stepped,
-            )
+            stepped = jax.vmap(lambda row: step(numbers, row))(some)
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
 
         columns = layout.state.size + outputs.size

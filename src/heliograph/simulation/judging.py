@@ -39,35 +39,8 @@ def reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, j
     }
 
 
-# Traced once for the step with all data and for that without some: tracing is most of what a step takes to compile.
+# Traced once, for the shapes of its results and for the loop's body: tracing is most of what a step takes to compile.
 _step: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
-
-
-def step_with_all(
-    filters: AllFilters,
-    states: PyTree,
-    z: Sequence[jax.Array],
-    u: jax.Array,
-    k: jax.Array,
-    drawn: Mapping[str, Drawn] | None = None,
-) -> Stepped:
-    """Step all filters with all data, which they judge."""
-    nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
-    return _step(filters, states, z, u, k, drawn, nothing)
-
-
-def step_without(
-    filters: AllFilters,
-    first: Stepped,
-    states: PyTree,
-    z: Sequence[jax.Array],
-    u: jax.Array,
-    k: jax.Array,
-    drawn: Mapping[str, Drawn] | None = None,
-) -> Stepped:
-    """Repeat a step, where each filter skips what it judged implausible the first time."""
-    after, outputs = _step(filters, states, z, u, k, drawn, reasons(first[1]))
-    return after, outputs | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
 
 def plausible_step(
@@ -78,11 +51,26 @@ def plausible_step(
     k: jax.Array,
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
-    """Step all filters without implausible data; the second step is taken only where some is."""
-    first = step_with_all(filters, states, z, u, k, drawn)
-    stepped: Stepped = jax.lax.cond(
-        implausible(first[1]), lambda: step_without(filters, first, states, z, u, k, drawn), lambda: first
-    )
+    """Step all filters with all data, which they judge; where some is implausible, step again without it.
+
+    In the second turn each filter skips what it judged implausible in the first, whose judgements stay.
+    """
+    nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
+    _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, nothing)
+
+    def goes_on(carry: tuple[jax.Array, Stepped]) -> jax.Array:
+        turn, (_, outputs) = carry
+        return (turn == 0) | (turn == 1) & implausible(outputs)
+
+    def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
+        turn, (_, before) = carry
+        after, outputs = _step(filters, states, z, u, k, drawn, reasons(before))
+        for name in ("judged", "judged_centrally"):
+            outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
+        return turn + 1, (after, outputs)
+
+    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
+    stepped: Stepped = jax.lax.while_loop(goes_on, step, (jnp.asarray(0), (states, start)))[1]
     return stepped
 
 
