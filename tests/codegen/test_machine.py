@@ -1,6 +1,7 @@
 """Code in haste, and with care once its executions have cost as much: the same bits."""
 
 import gc
+from threading import Event
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 
 from heliograph.codegen import compiled
 from heliograph.codegen.compiled import Alone, compile
-from heliograph.codegen.machine import LARGE, OFTEN, SMALL, often
+from heliograph.codegen.machine import LARGE, OFTEN, SMALL, background, often
 from heliograph.codegen.nodes import Node
 from heliograph.codegen.program import lower
 
@@ -53,9 +54,30 @@ def test_code_is_generated_with_care_when_its_executions_have_cost_as_much(code)
     calls = [code(STARTS) for _ in range(int(count) - 1)]
     assert level(code) == 0
     calls.append(code(STARTS))
+    background().submit(int).result()  # after what was asked for before
     assert level(code) == 1
+    calls.append(code(STARTS))
     for a, b in zip(*map(jax.tree.leaves, (calls[0], calls[-1])), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_calls_go_on_in_haste_while_care_is_taken(code):
+    released, source = Event(), code.code.blocks
+    background().submit(released.wait, 60)
+    code(STARTS)
+    enough = often(source.operations) * source.operations / source.work  # blocks
+    hasty = code.blocks.machine(enough / 2)
+    assert code.blocks.machine(enough / 2) is hasty and hasty.level == 0
+    released.set()
+    background().submit(int).result()
+    assert level(code) == 1
+
+
+def test_care_that_failed_is_an_error_of_the_next_call(code, monkeypatch):
+    code(STARTS)
+    monkeypatch.setattr("heliograph.codegen.machine.Machine", lambda *arguments: [].pop())
+    with pytest.raises(IndexError, match="pop from empty list"):
+        code.blocks.machine(OFTEN)
 
 
 def test_small_programs_wait_less_for_care():
@@ -73,11 +95,11 @@ def test_a_call_that_executes_its_code_often_waits_for_care(code):
     assert level(code) == 1
 
 
-def test_prepared_code_is_not_generated_again(code):
+def test_prepared_code_is_not_generated_by_the_first_call(code):
     code.prepare()
     prepared = code.blocks.machine(0)
     code(STARTS)
-    assert code.blocks.machine(OFTEN) is prepared and prepared.level == 1
+    assert code.blocks.machine(0) is prepared
 
 
 def test_no_code_is_generated_with_care_without_optimizations(code):

@@ -46,7 +46,8 @@ class Begun:
         if program.once is not None:
             number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
             pointers = self._pointers(number, results)
-            program.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+            once = program.once.machine(1)
+            once.run(pointers.ctypes.data, 0, 0, 1, 1)
         for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])

@@ -13,7 +13,7 @@ import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
-from heliograph.codegen.machine import ALWAYS, LONG, WIDEST, Function, Machine, Tiers, features, narrow
+from heliograph.codegen.machine import LONG, WIDEST, Function, Machine, Tiers, features, narrow
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
@@ -48,10 +48,10 @@ class Compiled:
         return new
 
     def prepare(self) -> None:
-        """Generate the code with care now, so that no later call takes the time."""
+        """Generate the code now, so that the first call does not take the time."""
         for code in (self.blocks, self.once):
             if code is not None:
-                code.machine(ALWAYS)
+                code.machine(0)
 
     def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
         """Return the results of all runs, with a leading axis of runs."""
@@ -64,7 +64,8 @@ class Compiled:
         ends = addresses([*outputs, shared])
         pointers = np.array([*self._addresses, *addresses(arrays[given:]), *self._tables, *ends], dtype=np.uint64)
         if self.once is not None:
-            self.once.machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+            once = self.once.machine(1)
+            once.run(pointers.ctypes.data, 0, 0, 1, 1)
             self._copy_common(outputs, shared)
         if not all(code.common):
             self._run(pointers, runs, cores)

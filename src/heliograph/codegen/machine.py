@@ -1,8 +1,8 @@
 """Code of this machine from text of LLVM IR: generated in haste at first, and with care once it is executed often."""
 
 import ctypes
-import math
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from threading import Lock
 
@@ -18,7 +18,6 @@ SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_in
 # saves a seventh to a half of its time, 0.03 to 0.3 ns for a block of runs. Of thirteen filters of 180 to 42,000
 # operations, it pays after 160,000 to 1,600,000; of small ones it takes milliseconds, and comes sooner.
 OFTEN, SMALL, LARGE = 500_000, 1_000, 10_000  # executions of programs of LARGE operations; in proportion down to SMALL
-ALWAYS = math.inf  # executions of code in live use, which a later call must not generate again
 
 # Operations of a step of one plant above which care seldom pays: LLVM takes four to nine times as long (for 300
 # particles of two states, 77,000 operations, 41 s instead of 4) to save a third to half of its 0.25 ms.
@@ -80,24 +79,36 @@ def narrow() -> int:
     return WIDEST if "+avx512f" in features()[1].split(",") else WIDEST // 2
 
 
+@cache
+def background() -> ThreadPoolExecutor:
+    """Return the thread that generates code with care while that in haste is executed."""
+    return ThreadPoolExecutor(1)
+
+
 class Tiers:
     """Code of one text, generated again with care when its executions have cost as much as that.
 
-    A program that is executed `often` is generated with care at once, if its first call says so. Both have the same
-    results, bit for bit, so that nothing but time depends on earlier calls. `widths` are the runs of a vector in haste
-    and with care.
+    A call that executes a program `often` waits for care; any other goes on in haste until care is done in the
+    background. Both have the same results, bit for bit, so that nothing but time depends on earlier calls. `widths` are
+    the runs of a vector in haste and with care.
     """
 
     def __init__(self, source: Source, widths: tuple[int, int]):
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
         self._machine: Machine | None = None
+        self._careful: Future[Machine] | None = None
 
     def machine(self, blocks: float) -> Machine:
-        """Return code that is about to be executed for so many blocks of the most runs."""
+        """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
         with self._lock:
-            self._executions += blocks * self._source.work / max(self._source.operations, 1)
-            careful = self._executions >= often(self._source.operations)
-            level = int(careful and not jax.config.values["jax_disable_most_optimizations"])
-            if self._machine is None or self._machine.level < level:
-                self._machine = Machine(self._source, level, self._widths[level])
+            source, executions = self._source, blocks * self._source.work / max(self._source.operations, 1)
+            self._executions += executions
+            pays = often(source.operations)
+            level = int(self._executions >= pays and not jax.config.values["jax_disable_most_optimizations"])
+            if self._machine is None:
+                self._machine = Machine(source, level, self._widths[level])
+            elif self._machine.level < level:
+                self._careful = self._careful or background().submit(Machine, source, level, self._widths[level])
+                if executions >= pays or self._careful.done():
+                    self._machine = self._careful.result()
             return self._machine
