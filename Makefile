@@ -23,14 +23,14 @@ help:  ## Show this list
 demo: .venv/.demo  ## Run the demonstration and write its report to out/
 	$(BIN)/heliograph demo --out out
 
-test: .venv/.test  ## Check style and types, run the tests that guard daily work (five to nine minutes on two cores)
+test: .venv/.test  ## Check style and types, run the tests that guard daily work (five to ten minutes on two cores)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy --strict src studies & types=$$!; \
 	$(BIN)/pytest $(SPREAD) -m "not slow"; tests=$$?; \
 	wait $$types && exit $$tests
 
-check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (ten to sixteen more)
+check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (ten to eighteen more)
 	$(BIN)/pytest $(SPREAD) -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
