@@ -53,7 +53,7 @@ def plausible_step(
 ) -> Stepped:
     """Step all filters with all data, which they judge; where some is implausible, step again without it.
 
-    In the second turn each filter skips what it judged implausible in the first, whose judgements stay.
+    In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay.
     """
     nothing = [jnp.zeros((a.count, a.nodes)) for a in filters.alike], {name: jnp.zeros(()) for name in filters.central}
     _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, nothing)
