@@ -38,11 +38,13 @@ def test_only_filters_that_weigh_say_that_they_do():
 def test_the_output_with_outliers_is_to_blame(recorded):
     left, right = weighed_outputs(NETWORK, hg.run(NETWORK, {"tank": recorded}))
     arrived = ~np.isnan(recorded)
-    assert (left.summary.received, right.summary.received) == tuple(arrived.sum(axis=0))
+    assert (left.judged.summary.received, right.judged.summary.received) == tuple(arrived.sum(axis=0))
     # Of the 20 rows with 15 more (14 deviations of an innovation) those that arrived, and the law's own 2 %.
     off = arrived[::10, 0].sum()
-    assert off <= left.summary.down_weighted <= off + 9 and left.to_blame and not right.to_blame
-    assert str(left).startswith(f"tank/robust: left: {left.summary.down_weighted} of {left.summary.received} down-we")
+    assert off <= left.judged.summary.down_weighted <= off + 9 and left.judged.to_blame and not right.judged.to_blame
+    assert str(left).startswith(
+        f"tank/robust: left: {left.judged.summary.down_weighted} of {left.judged.summary.received} down-we"
+    )
     assert str(left).endswith("; to blame: more than of the others") and "to blame" not in str(right)
 
 
@@ -51,8 +53,8 @@ def test_only_a_filter_that_the_network_relies_on_blames_an_output_where_it_weig
     two = {"robust": FILTERS["robust"], "again": FILTERS["robust"]}
     network = hg.Network(PLANT, {"tank": hg.Node(SENSOR, LINK, two)})
     items = weighed_outputs(network, hg.run(network, {"tank": recorded}))
-    assert [(item.filter, item.output) for item in items if item.to_blame] == [("robust", "left")]
-    assert items[0].summary == items[2].summary
+    assert [(item.filter, item.judged.output) for item in items if item.judged.to_blame] == [("robust", "left")]
+    assert items[0].judged.summary == items[2].judged.summary
 
 
 @pytest.mark.slow
@@ -61,7 +63,7 @@ def test_the_page_and_the_last_lines_have_the_same_numbers(recorded, tmp_path, f
     assert [item.weighs for item in health.outputs] == [True, True, False, False]
     page = run_page(health, "tank", dict.fromkeys(run_figures(health), b"<svg/>")).html()
     fits(page)
-    left = health.outputs[0].summary
+    left = health.outputs[0].judged.summary
     assert f"{left.received} of {STEPS}" in page and "to blame" in page
     numbers = json.loads(json.dumps(run_summary(health)))["outputs"]["tank"]
     assert numbers["robust"]["left"]["down_weighted"] == left.down_weighted and numbers["robust"]["left"]["to_blame"]

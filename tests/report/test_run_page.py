@@ -10,7 +10,8 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.report.health import FilterHealth, Link, examine
+from heliograph.report.arrivals import Arrivals
+from heliograph.report.health import FilterHealth, examine
 from heliograph.report.outputs import errors_of, rounded
 from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
 from heliograph.simulation.results.whiteness import MemoryTest
@@ -53,16 +54,22 @@ def test_claims_are_judged_by_innovations(health):
 def test_links_are_said_as_they_were(health):
     links = {(link.node, link.component): link for link in health.links}
     item = links[BAD, "right"]
-    assert item.share == 1 - 4 / STEPS and item.longest_gap == 4 and not item.loses and links["a", "left"].loses
-    assert Link("a", "b", np.zeros(7, bool), np.zeros(0), True).longest_gap == 7
-    assert Link("a", "b", np.ones(7, bool), np.zeros(7), True).longest_gap == 0
+    assert (
+        item.share == 1 - 4 / STEPS
+        and item.longest_gap == 4
+        and not item.may_be_lost
+        and links["a", "left"].may_be_lost
+    )
+    rows = np.arange(7.0)
+    assert Arrivals("a", "b", rows, np.zeros(7, bool), np.zeros(0), True).longest_gap == 7
+    assert Arrivals("a", "b", rows, np.ones(7, bool), np.zeros(7), True).longest_gap == 0
 
 
 def test_what_is_doubtful_is_said_and_no_more(health):
     lines = health.warnings()
     assert len([line for line in lines if "a/sure is too sure" in line]) == 1
     assert any("right is missing in 1.3% of the rows; the network says that it is never lost" in line for line in lines)
-    assert not any("a/good" in line or "left" in line for line in lines)
+    assert not any("a/good" in line or "a: left" in line for line in lines)
 
 
 def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
@@ -193,7 +200,7 @@ def test_a_filter_to_compare_with_is_no_doubt_about_the_network(fits):
     assert figures["estimates_0"].axes[0].get_ylabel() == "level (m)"
     page = run_page(health_, "net", dict.fromkeys(figures, b"<svg/>")).html()
     fits(page)
-    assert "The recording agrees with the network" in page and "there to be compared with" in page
+    assert "No doubts." in page and "there to be compared with" in page
     assert "None is missing" in page and "orange" not in page
 
 
@@ -201,10 +208,10 @@ def test_many_filters_do_not_make_a_doubt_of_chance(health):
     """Twenty tests at a level of 1 % each made a doubt in half of all recordings of twenty nodes that were right."""
 
     def judged(power: float, p_value: float, count: int) -> list[str]:
-        test = MemoryTest(np.zeros(1), np.full(1, 0.1), p_value, 0.0, power, 0.1 * power)
+        test = MemoryTest(np.full(1, 0.3), np.full(1, 0.1), p_value, 0.0, power, 0.1 * power)
         quiet = replace(test, power=1.0, p_value=0.5)
         of = [FilterHealth("a", f"f{i}", "exact", None, quiet if i else test) for i in range(count)]
-        return replace(health, filters=of, links=[]).warnings()
+        return replace(health, filters=of, links=[], outputs=[]).warnings()
 
     # Normal quantiles of 1 % and 1 % / 20, both sides: 2.58 and 3.48 relative errors of 0.1.
     for count, errors in ((1, 2.58), (20, 3.48)):
@@ -214,9 +221,53 @@ def test_many_filters_do_not_make_a_doubt_of_chance(health):
     assert len(judged(1.0, 0.009, 1)) == 1 and judged(1.0, 0.009, 20) == []
 
 
-def test_a_doubt_names_its_filter(health):
-    title = run_page(health, "net", dict.fromkeys(run_figures(health), b"<svg/>")).title
-    assert title.endswith(" about the network: a/sure")
+def test_the_title_is_the_result_and_doubts_follow(health):
+    """The last estimate with two claimed deviations; of the doubts the three that matter most."""
+    page = run_page(health, "net", dict.fromkeys(run_figures(health), b"<svg/>"))
+    estimate = health.record.estimates["a"]["sure"]
+    deviation = float(np.sqrt(estimate.covariance[-1, 0, 0]))
+    assert page.title == (
+        f"level {rounded(estimate.mean[-1, 0], deviation)} ± {rounded(2 * deviation, deviation)} at the end, by sure"
+    )
+    many = replace(health, links=[replace(health.links[-1], component=f"c{i}") for i in range(9)])
+    points = run_page(many, "net", {}).sections[0].blocks[1].points
+    assert len(points) == 3 and len(many.warnings()) == 11  # nine links, size and memory of a/sure
+
+
+def test_a_sender_that_is_slower_than_the_rows_loses_nothing():
+    """Each fifth row, on time or nearly: due each half second; of losses at random no interval is a period."""
+    rng = np.random.default_rng(0)
+    time = np.arange(1000) * 0.1
+    there = np.arange(1000) % 5 == 2
+    slow = Arrivals("a", "odom", time, there, np.zeros(there.sum()), False)
+    assert np.isclose(slow.period, 0.5) and slow.share == 1 and slow.longest_gap == 0
+    there[[7, 102, 107]] = False  # three of 200 are lost, two of them in a row
+    slow = Arrivals("a", "odom", time, there, np.zeros(there.sum()), False)
+    assert np.isclose(slow.period, 0.5) and slow.due == 200 and slow.share == 197 / 200 and slow.longest_gap == 2
+    for probability in (0.9, 0.5, 0.25):
+        came = rng.random(1000) < probability
+        lossy = Arrivals("a", "odom", time, came, np.zeros(came.sum()), True)
+        assert lossy.period is None and np.isclose(lossy.share, came.mean())
+    dated = Arrivals("a", "odom", np.datetime64("2026-11-28", "ns") + (time * 1e9).astype("timedelta64[ns]"), there,
+                     np.zeros(there.sum()), False)  # fmt: skip
+    assert np.isclose(dated.period, 0.5) and dated.share == 197 / 200
+
+
+def test_several_rates_are_no_doubt():
+    """A recording of the network's own world, rows at the stamps of two nodes with rates of their own."""
+    plant = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0, states=["x"])
+    sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["y"])
+    nodes = {name: hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)}) for name in "ab"}
+    network = hg.Network(plant, nodes)
+    z = {name: values[0].copy() for name, values in hg.monte_carlo(network, 600, 1, key=0).measurements.items()}
+    z["b"][np.arange(600) % 4 != 0] = np.nan
+    health = examine(network, hg.run(network, z), np.zeros((600, 0)))
+    assert health.warnings() == [] and health.links[1].period == 4.0
+    periodic = hg.Network(plant, {"b": hg.Node(sensor, hg.perfect(), nodes["b"].filters, trigger=hg.Periodic(4))})
+    z["b"][np.arange(600) % 40 == 0] = np.nan
+    link = examine(periodic, hg.run(periodic, {"b": z["b"]}), np.zeros((600, 0))).links[0]
+    # The first of 150 did not come, and no period begins before it.
+    assert link.period == 4.0 and link.share == 135 / 149 and not link.may_be_lost
 
 
 def test_numbers_are_rounded_by_their_standard_error():

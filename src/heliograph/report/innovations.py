@@ -74,9 +74,9 @@ def innovations_section(health: Health, drawings: Mapping[str, bytes]) -> Sectio
         filters[0].node: Picture(drawings[name], "Innovations over time in claimed deviations",
                                  f"Innovations in claimed standard deviations, one colour an output (of more than "
                                  f"{len(COLOURS)} one for all); 5 of 100 may lie beyond ±{BAND:g}.")
-        for name, filters in tested.items()
+        for name, filters in tested.items() if name in drawings
     }  # fmt: skip
-    drawn = {filter.node for filters in tested.values() for filter in filters}
+    drawn = {filter.node for name, filters in tested.items() if name in drawings for filter in filters}
     left = [f"{filter.node}/{filter.filter}" for filter in health.filters
             if filter.white is not None and filter.node not in drawn]  # fmt: skip
     # Fusions of estimates, which are in no row.
@@ -107,9 +107,9 @@ def _tests_table(health: Health) -> Table:
     # What the columns are, in words.
     caption = (
         "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
-        "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
-        "one row apart: 0 where the filter uses all that it receives. Both with 95 % intervals; **p**: probability of "
-        "such a correlation if there were none."
+        "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations one message apart: "
+        "0 where the filter uses all that it receives. Both with 95 % intervals; **p**: probability of such a "
+        "correlation if there were none."
     )
     return Table(["filter", "claim", "size", "correlation", "p"], rows, caption)
 
@@ -123,21 +123,22 @@ def _outputs_table(health: Health) -> list[Table]:
     rows = []
     for output in health.outputs:
         # Numbers of the summary; the bias to two digits of its standard error.
-        s = output.summary
+        judged, s = output.judged, output.judged.summary
         doubted = f"{s.down_weighted} ({100 * s.share.low:.2g} to {100 * s.share.high:.2g} %)" if output.weighs else "–"
         half = (s.bias_high - s.bias_low) / 2
         error = half / 1.96
-        name = visible(f"{output.node}/{output.filter}: {output.output}")
         bias = f"{rounded(s.bias, error)} ± {rounded(half, error)}"
-        rows.append([name, f"{s.received} of {s.expected}", doubted, bias, f"{s.squared:.2f}",
-                     "to blame" if output.to_blame else ""])  # fmt: skip
+        size = f"{rounded(judged.size, judged.size_error)} ± {rounded(1.96 * judged.size_error, judged.size_error)}"
+        said = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
+        rows.append([output.name, f"{s.received} of {s.expected}", doubted, bias, size, ", ".join(said)])
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
-        "of the innovations in the output's unit. **d²**: mean square of an innovation over its variance, 1 where the "
-        "model is right. All with 95 % intervals that allow for correlated rows. **To blame**: its share "
-        "lies above that of the filter's other outputs together, by an interval of the difference."
+        "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
+        "innovations that the filter used over their variance, 1 where the model is right. All with 95 % intervals "
+        "that allow for correlated rows. **To blame**: its share lies above that of the filter's other outputs "
+        "together, by an interval of the difference. **Stuck**: one value repeats for longer than its noise allows."
     )
-    return [Table(["filter: output", "received", "down-weighted", "bias", "d²", ""], rows, caption)] if rows else []
+    return [Table(["filter: output", "received", "down-weighted", "bias", "size", ""], rows, caption)] if rows else []
 
 
 def chosen(pictures: Mapping[str, Picture]) -> list[Picture | Choice]:

@@ -9,9 +9,11 @@ import numpy as np
 
 from heliograph.disk.quoting import visible
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.innovation import InnovationSummary, Weighed, outlying, summarise_innovations
+from heliograph.filters.innovation import HALF, InnovationSummary, Weighed, outlying, summarise_innovations
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
+from heliograph.report.held import HeldValue, held_value
+from heliograph.report.medians import law_medians
 from heliograph.report.results import Json
 from heliograph.simulation.network import FUSED, Network, claim_at
 from heliograph.simulation.results.record import Record
@@ -67,25 +69,40 @@ def rounded(value: float, error: float) -> str:
     return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"
 
 
-class OutputHealth(NamedTuple):
-    """Innovations of one received number under one filter.
+class OutputJudgement(NamedTuple):
+    """What the innovations of one filter say of one received number.
 
-    weighs: whether the filter weighs what arrives. to_blame: whether more of its values are down-weighted than of the
-    filter's others together, by an interval of the difference, and the filter is one that the network relies on where
-    any of these weighs.
+    to_blame: whether more of its values are down-weighted than of the filter's others together, by an interval of the
+    difference, and the filter is one that the network relies on where any of these weighs. size: mean square of the
+    innovations that the filter used (of weight 1/2 or more) over their claimed variance, 1 where the claim holds, with
+    its standard error. held: the longest run of equal values, where chance makes none as long; None elsewhere.
     """
+
+    output: str
+    to_blame: bool
+    summary: InnovationSummary
+    size: float
+    size_error: float
+    held: HeldValue | None
+
+
+class OutputHealth(NamedTuple):
+    """The judgement of one received number under one filter; weighs: whether the filter weighs what arrives."""
 
     node: str
     filter: str
-    output: str
     weighs: bool
-    to_blame: bool
-    summary: InnovationSummary
+    judged: OutputJudgement
+
+    @property
+    def name(self) -> str:
+        """Name the filter and the output, such as "radio/robust: left"."""
+        return visible(f"{self.node}/{self.filter}: {self.judged.output}")
 
     def __str__(self) -> str:
         """One line, such as "radio/robust: left: 7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
-        blame = "; to blame: more than of the others" if self.to_blame else ""
-        return visible(f"{self.node}/{self.filter}: {self.output}: {self.summary}{blame}")
+        blame = "; to blame: more than of the others" if self.judged.to_blame else ""
+        return f"{self.name}: {self.judged.summary}{blame}"
 
 
 class Listener(NamedTuple):
@@ -140,26 +157,48 @@ def weighs(filter: AbstractFilter) -> bool:
     return innovation.weight is not None
 
 
-def outputs_of(listener: Listener, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
-    """Summarise the innovations of one filter that claims a covariance, by output."""
-    known = record.weighed.get(listener.node, {}).get(listener.name)
-    if known is not None:
-        return _health(listener.node, listener.name, listener.outputs, known, True, listener.blames)
-    outcome = listener.filter.run(listener.measurements, inputs)
-    variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
-    innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
-    return _health(listener.node, listener.name, listener.outputs, innovations, False, False)
+def outputs_of(network: Network, listener: Listener, record: Record, inputs: np.ndarray) -> list[OutputHealth]:
+    """Judge each output by the innovations of one filter that claims a covariance.
+
+    A median that the node's law of noise has itself, since it is not symmetric, is no bias.
+    """
+    innovations = record.weighed.get(listener.node, {}).get(listener.name)
+    weighed = innovations is not None
+    if innovations is None:
+        outcome = listener.filter.run(listener.measurements, inputs)
+        variance = np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1)
+        innovations = Weighed(outcome.innovations, variance, np.ones_like(outcome.innovations))
+    medians = law_medians(network, listener.node, _typical(np.asarray(innovations.variance)))
+    judged = judge_outputs(listener.outputs, listener.measurements, innovations, medians, weighed and listener.blames)
+    return [OutputHealth(listener.node, listener.name, weighed, output) for output in judged]
 
 
-def _health(
-    node: str, name: str, outputs: Sequence[str], innovations: Weighed, weighed: bool, blames: bool
-) -> list[OutputHealth]:
-    summaries = summarise_innovations(innovations)
-    outliers = outlying(summaries) if blames else []
-    return [
-        OutputHealth(node, name, output, weighed, i in outliers, summary)
-        for i, (output, summary) in enumerate(zip(outputs, summaries, strict=True))
+def _typical(variance: np.ndarray) -> np.ndarray:
+    """Median over time by output; 0 where none arrived."""
+    came = ~np.isnan(variance)
+    return np.array([np.median(column[there]) if there.any() else 0.0
+                     for column, there in zip(variance.T, came.T, strict=True)])  # fmt: skip
+
+
+def judge_outputs(
+    names: Sequence[str], received: np.ndarray, innovations: Weighed, medians: np.ndarray, blames: bool
+) -> list[OutputJudgement]:
+    """Judge each output by its innovations (time, m), and by the values that were received (time, m).
+
+    `medians` (m,): of innovations under a law that is not symmetric. `blames`: whether weights tell of outliers.
+    """
+    summaries = [
+        summary._replace(bias=summary.bias - m, bias_low=summary.bias_low - m, bias_high=summary.bias_high - m)
+        for summary, m in zip(summarise_innovations(innovations), medians, strict=True)
     ]
+    outliers = outlying(tuple(summaries)) if blames else []
+    value, variance, weight = (np.asarray(column) for column in innovations)
+    used = np.where(weight >= HALF, value**2 / variance, np.nan)
+    judged = []
+    for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
+        size = correlated_mean(used[:, i]) if np.any(~np.isnan(used[:, i])) else (np.nan, np.nan)
+        judged.append(OutputJudgement(name, i in outliers, summary, *size, held_value(received[:, i], variance[:, i])))
+    return judged
 
 
 class RecentOutputs:
@@ -179,36 +218,43 @@ class RecentOutputs:
 
     def health(self) -> list[OutputHealth]:
         """Summarise each output of each filter over its newest rows."""
-        summaries = []
+        results = []
         for (node, name), rows in self._rows.items():
             innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))
-            names = self.names.get((node, name)) or [str(i + 1) for i in range(innovations.value.shape[1])]
-            summaries += _health(node, name, names, innovations, True, True)
-        return summaries
+            count = innovations.value.shape[1]
+            names = list(self.names.get((node, name)) or [str(i + 1) for i in range(count)])
+            unknown = np.full(innovations.value.shape, np.nan)  # what was received is not kept
+            judged = judge_outputs(names, unknown, innovations, np.zeros(count), True)
+            results += [OutputHealth(node, name, True, output) for output in judged]
+        return results
 
 
 def weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Summarise the innovations of all filters that weigh what arrives in a recording, by output."""
     chosen = (x for x in listeners(network, record) if x.name in record.weighed.get(x.node, {}))
-    return [output for x in chosen for output in outputs_of(x, record, np.zeros(0))]
+    return [output for x in chosen for output in outputs_of(network, x, record, np.zeros(0))]
 
 
 def output_numbers(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output for a summary; None where there are none."""
-    summary = health.summary
+    judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
-                                "squared": summary.squared}  # fmt: skip
+                                "squared": summary.squared, "size": judged.size,
+                                "size_error": judged.size_error}  # fmt: skip
     if health.weighs:
         values |= {"weight": summary.weight, "share": summary.share.estimate, "share_low": summary.share.low,
                    "share_high": summary.share.high}  # fmt: skip
     counted: dict[str, Json] = {"expected": summary.expected, "received": summary.received}
     if health.weighs:
-        counted |= {"down_weighted": summary.down_weighted, "to_blame": health.to_blame}
+        counted |= {"down_weighted": summary.down_weighted, "to_blame": judged.to_blame}
+    if judged.held is not None:
+        counted |= {"held": judged.held.readings, "held_from_row": judged.held.first_row + 1}
     return counted | {name: None if np.isnan(value) else value for name, value in values.items()}
 
 
 def output_row(health: OutputHealth) -> dict[str, Json]:
     """Return the numbers of one output with its names, and in words."""
-    words = str(health.summary) + ("; to blame" if health.to_blame else "")
-    named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": health.output, "words": words}
+    judged = health.judged
+    words = str(judged.summary) + ("; to blame" if judged.to_blame else "")
+    named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": judged.output, "words": words}
     return named | output_numbers(health)

@@ -24,9 +24,14 @@ from heliograph.report.innovations import (
 )
 from heliograph.report.outputs import errors_of, output_numbers, rounded
 from heliograph.report.page import Choice, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.position_map import coordinates_of, map_figure
 from heliograph.report.results import Json, Results
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record
+
+PAGE = 2_100_000  # bytes of the figures that a page holds, so that it has at most 3 MB
+FIRST = ("links", "innovations", "innovations_0", "map", "estimates_0")  # figures that come before others
+DOUBTS = 3  # that the page shows; `summary.json` has all
 
 
 def run_results(health: Health, network: str) -> Results:
@@ -37,12 +42,21 @@ def run_results(health: Health, network: str) -> Results:
 def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links."""
     drawn: dict[str, Figure] = {}
+    if coordinates_of(health.record.states) is not None:
+        for kind, record in _estimated(health):
+            node = _nodes(record)[0]
+            drawn[_map_of(kind)] = map_figure(record, node, list(record.estimates[node])[: len(COLOURS)])
     for kind, record in _estimated(health):
         drawn |= {f"{kind}_{i}": _estimates(health, record, node) for i, node in enumerate(_nodes(record))}
     drawn |= {name: innovations_figure(health, tested) for name, tested in tested_by_figure(health).items()}
     if health.links:
         drawn["links"] = _links(health)
     return drawn
+
+
+def _map_of(kind: str) -> str:
+    """Return the name of the map of filtered or of smoothed estimates."""
+    return "map" if kind == "estimates" else f"map_{kind}"
 
 
 def _estimated(health: Health) -> list[tuple[str, Record]]:
@@ -75,7 +89,8 @@ def _links(health: Health) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
     for row, link in enumerate(links):
-        lost = health.record.time[~link.arrived]
+        # A sender that is slower than the rows loses nothing in those between.
+        lost = health.record.time[~link.arrived] if link.period is None else health.record.time[:0]
         came = health.record.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
@@ -88,52 +103,80 @@ def _links(health: Health) -> Figure:
 
 
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
-    """Return the report; `drawings` holds each figure as SVG."""
-    record, doubts = health.record, health.warnings()
+    """Return the report; `drawings` holds each figure as SVG, of which those stay that fit into a page."""
+    record, doubts, drawings = health.record, health.warnings(), within(drawings, PAGE)
     arrived = np.mean([link.share for link in health.links]) if health.links else np.nan
     # Three numbers to remember.
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
         KeyFigure(
-            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could receive", GREEN
+            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} should receive", GREEN
         ),
-        KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
+        KeyFigure("doubts", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
-    # Warnings are in the title and in the first section.
+    # The result is the title; doubts follow it.
     return Page(
-        kicker="Heliograph run",
-        title=f"{_counted(len(doubts), 'doubt')} about the network{_by_name(health)}"
-        if doubts
-        else "The recording agrees with the network",
+        kicker=f"Heliograph run: {visible(network)}",
+        title=_finding(health),
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
         + _agreement(health, doubts),
         sections=[
             Section("At a glance", [KeyFigures(keys), *_warned(doubts), *_compared(health)]),
-            Section(
-                "Estimates",
-                [
-                    *errors_table(record),
-                    *_pictures(health, drawings),
-                    *not_drawn(_ordered(record)[MOST:], "Their estimates are in the record."),
-                ],
-            ),
+            Section("Estimates", [*errors_table(record), *_pictures(health, drawings)]),
             innovations_section(health, drawings),
             Section("Links", _health(health, drawings)),
         ],
     )
 
 
-def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice]:
-    """Return the filtered estimates by node, then the smoothed ones if there are any."""
-    pictures: list[Picture | Choice] = []
+def within(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
+    """Return the drawings in their order that together have at most `limit` bytes; pages hold them by 4/3 of that."""
+    kept, size = dict[str, bytes](), 0
+    for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
+        if size + len(drawings[name]) <= limit:
+            kept[name] = drawings[name]
+            size += len(drawings[name])
+    return kept
+
+
+def _finding(health: Health) -> str:
+    """Return the last estimate of the filter that the network relies on: its first two states, or its position."""
+    record = health.record
+    node = _nodes(record)[0] if _nodes(record) else None
+    if node is None:
+        return f"{len(record.time):,} rows were read"
+    trusted = {filter.filter for filter in health.filters if filter.trusted and filter.node == node}
+    name = next((name for name in record.estimates[node] if name in trusted), next(iter(record.estimates[node])))
+    estimate = record.estimates[node][name]
+    mean = np.asarray(estimate.mean)[-1]
+    deviation = np.sqrt(np.maximum(np.diagonal(np.asarray(estimate.covariance)[-1]), 0.0))
+    shown = coordinates_of(record.states) or tuple(range(min(len(mean), 2)))
+    numbers = []
+    for i in shown:
+        band = f" ± {rounded(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""
+        state, unit = record.states[i], record.units.get(record.states[i], "")
+        named = state.removesuffix(f"({unit})").strip()
+        numbers.append(f"{visible(named)} {rounded(mean[i], deviation[i])}{band} {visible(unit)}".strip())
+    return f"{', '.join(numbers)} at the end, by {visible(name)}"
+
+
+def _pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Picture | Choice | Text]:
+    """Return the map of a position if there is one, the estimates by node, then the smoothed ones if there are any."""
+    pictures: list[Picture | Choice | Text] = []
     for kind, record in _estimated(health):
         added = ", given later data too" if kind == "smoothed" else ""
+        if (name := _map_of(kind)) in drawings:
+            text = f"The path that {visible(_nodes(record)[0])} estimates{added}"
+            pictures.append(Picture(drawings[name], text, f"{text}, with ellipses of {BAND:g} claimed deviations."))
         pictures += chosen({
             node: Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                           f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each "
                           f"side{added}.")
-            for i, node in enumerate(_nodes(record))
+            for i, node in enumerate(_nodes(record)) if f"{kind}_{i}" in drawings
         })  # fmt: skip
+        absent = [node for i, node in enumerate(_nodes(record)) if f"{kind}_{i}" not in drawings]
+        pictures += not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
+        pictures += not_drawn(_ordered(record)[MOST:], "Their estimates are in the record.")
     return pictures
 
 
@@ -165,7 +208,7 @@ def _headed(state: str, units: Mapping[str, str]) -> str:
 
 def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
-        return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
+        return f"There {'is' if len(doubts) == 1 else 'are'} {_counted(len(doubts), 'doubt')} about the network."
     tested = any(tested_filter.test is not None for tested_filter in health.filters)
     tests = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
     return f"Nothing is lost that the network says cannot be lost, and {tests}."
@@ -182,12 +225,11 @@ def _span(time: np.ndarray) -> str:
 
 
 def _warned(doubts: list[str]) -> list[Points | Text]:
-    return [Points([visible(line) for line in doubts])] if doubts else [Text(["No warnings."])]
-
-
-def _by_name(health: Health) -> str:
-    names = [visible(f"{doubted.node}/{doubted.filter}") for doubted in health.doubted()]
-    return f": {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}" if names else ""
+    """Return the doubts that matter most, and where the others are."""
+    if not doubts:
+        return [Text(["No doubts."])]
+    more = f"{_counted(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
+    return [Points([visible(line) for line in doubts[:DOUBTS]]), *([Text([more])] if len(doubts) > DOUBTS else [])]
 
 
 def _compared(health: Health) -> list[Text | Points]:
@@ -201,17 +243,28 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     rows = []
     for link in health.links:
         mean, deviation = _moments(link.values)
-        known = "may be lost" if link.loses else "never lost"
+        known = "may be lost" if link.may_be_lost else "never lost"
         name = visible(f"{link.node}: {link.component}")
-        rows.append([name, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
-    headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
+        sent = "each row" if link.period is None else f"each {link.period:.4g}"
+        rows.append([name, sent, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
+    headers = ["received", "due", "arrived", "longest gap", "the network says", "mean", "std. deviation"]
+    unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
+    slower = (
+        f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
+        "found; a **gap** counts what was due and did not come."
+    )
     came, lost = any(link.arrived.any() for link in health.links), not all(link.arrived.all() for link in health.links)
     parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
     caption = f"When each component {' and when it '.join(parts)}." + ("" if lost else " None is missing.")
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     left = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
     missing = not_drawn(left, "Their numbers are in the table.")
-    return [Table(headers, rows), *picture, *missing, *shared_text(health.shared)]
+    return [
+        Table(headers, rows, slower if any(link.period is not None for link in health.links) else ""),
+        *picture,
+        *missing,
+        *shared_text(health.shared),
+    ]
 
 
 def _moments(values: np.ndarray) -> tuple[str, str]:
@@ -248,7 +301,7 @@ def run_summary(health: Health) -> dict[str, Json]:
     # What the innovations say of each output.
     outputs: dict[str, dict[str, dict[str, Json]]] = {}
     for output in health.outputs:
-        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.output] = output_numbers(output)
+        outputs.setdefault(output.node, {}).setdefault(output.filter, {})[output.judged.output] = output_numbers(output)
     # Errors, where the truth is known.
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in errors_of(health.record):
@@ -258,7 +311,9 @@ def run_summary(health: Health) -> dict[str, Json]:
     # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
-        links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}
+        numbers: dict[str, Json] = {"arrived": link.share, "longest_gap": link.longest_gap}
+        period: dict[str, Json] = {} if link.period is None else {"period": link.period}
+        links.setdefault(link.node, {})[link.component] = numbers | period
     return {
         "rows": len(health.record.time),
         "warnings": health.warnings(),

@@ -113,7 +113,7 @@ def _outputs(watch: Watch) -> Iterable[Metric]:
         numbers = output_numbers(output)
         for name, metric in metrics.items():
             if isinstance(value := numbers[name], float):
-                metric.add_metric([output.node, output.filter, output.output], value)
+                metric.add_metric([output.node, output.filter, output.judged.output], value)
     return metrics.values()
 
 

@@ -9,6 +9,7 @@ import scipy
 
 from heliograph.codegen.engine import computed
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.innovation import HALF
 from heliograph.filters.rows import data_of, over_rows
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance
@@ -115,7 +116,8 @@ def whitened_innovations(
 ) -> Float[np.ndarray, "steps m"]:
     """Innovations of a recording in units of the filter's claim: white and of variance 1 where the claim holds.
 
-    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could.
+    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could, and where a
+    filter that weighs gave less than half of a component's weight.
 
     Args:
         data: measurements of the filter (steps, received), NaN where a component did not arrive.
@@ -156,7 +158,7 @@ def innovations_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation covariance, by component.
 
-    NaN where it did not arrive, or the components before it determine it.
+    NaN where it did not arrive, counted less than half, or the components before it determine it.
     """
     likelihoods, white = computed(_innovations, _by_xla, (filter, z, u))
     return likelihoods, white
@@ -165,6 +167,8 @@ def innovations_of(
 def _innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
     def single(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = ~jnp.isnan(innovation.value)
+        if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
+            there &= innovation.weight >= HALF
         covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
         white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
         return jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan)

@@ -1,0 +1,97 @@
+"""Arrivals of one received number over a recording: when it was due, how often it came, how often it was lost."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from heliograph.numerics.types import Float
+
+FEW = 8  # arrivals from which a rate of its own can be told
+NEAR = 0.25  # of a period: how far an interval may be from whole periods
+REGULAR = 0.95  # least share of intervals that are whole periods
+SLOWER = 1.5  # rows between messages from which a sender is slower than the table
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """When one component of a node's measurement arrived, and the values that did.
+
+    Args:
+        node: name of the node.
+        component: name of the component.
+        time: times of the rows (time,), numbers or dates.
+        arrived: whether it arrived in each row (time,).
+        values: those that arrived.
+        may_be_lost: whether the network says that it may be lost, or is not always sent.
+        declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
+    """
+
+    node: str
+    component: str
+    time: np.ndarray
+    arrived: np.ndarray
+    values: np.ndarray
+    may_be_lost: bool
+    declared_period: int | None = None
+
+    @cached_property
+    def period(self) -> float | None:
+        """Time between messages of a sender that is slower than the rows, in seconds or the unit of `time`; else None.
+
+        Declared, or found: nearly all intervals between arrivals are whole multiples of their median. Losses of a
+        sender that is due in each row leave intervals of all lengths, and no such period.
+        """
+        clock = _clock(self.time)
+        spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
+        if self.declared_period is not None:
+            return self.declared_period * spacing if self.declared_period > 1 else None
+        intervals = np.diff(clock[self.arrived])
+        if len(intervals) < FEW - 1 or self.arrived.all():
+            return None
+        period = float(np.median(intervals))
+        if period < SLOWER * spacing or period <= 0:
+            return None
+        apart = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
+        return period if np.mean(apart <= NEAR) >= REGULAR else None
+
+    @property
+    def due(self) -> int:
+        """Number of messages that were due: one a row, or one a period from the first arrival to the last row."""
+        if self.period is None:
+            return len(self.arrived)
+        clock = _clock(self.time)
+        came = clock[self.arrived]
+        if not len(came):
+            return max(int((clock[-1] - clock[0]) / self.period), 1)
+        # Whole periods between arrivals, and those that passed after the last.
+        between = np.maximum(np.round(np.diff(came) / self.period), 1).sum()
+        return 1 + int(between) + self._due_since(clock, came)
+
+    @property
+    def share(self) -> float:
+        """Share of the messages that were due which arrived."""
+        return min(float(self.arrived.sum()) / self.due, 1.0)
+
+    @property
+    def longest_gap(self) -> int:
+        """Greatest number of messages in a row that were due and did not arrive."""
+        if self.period is None:
+            ends = np.flatnonzero(np.concatenate([[True], self.arrived, [True]]))
+            return int(np.max(np.diff(ends)) - 1)
+        clock = _clock(self.time)
+        came = clock[self.arrived]
+        intervals = np.round(np.diff(came) / self.period) - 1
+        return max(int(np.max(intervals, initial=0)), self._due_since(clock, came) if len(came) else self.due)
+
+    def _due_since(self, clock: np.ndarray, came: np.ndarray) -> int:
+        """Return the number of messages that were due since the last arrival, and are late by more than is usual."""
+        assert self.period is not None  # only then is it asked
+        return max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
+
+
+def _clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
+    """Times as numbers: dates in seconds after the first."""
+    if time.dtype.kind == "M":
+        return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
+    return np.asarray(time, dtype=float)

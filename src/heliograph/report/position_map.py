@@ -1,0 +1,64 @@
+"""Map of an estimated position: one state against another, where the two are coordinates of a plane."""
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from heliograph.disk.quoting import in_figure
+from heliograph.report.figures import INK, STYLE, WIDTH, legend_above
+from heliograph.simulation.results.plots import colour_of, with_unit
+from heliograph.simulation.results.record import Record
+
+# Names that two coordinates of a plane have, without what stands before them: "x" and "y", "position_x" and ...
+PAIRS = (("x", "y"), ("east", "north"), ("e", "n"), ("px", "py"), ("pos_x", "pos_y"), ("position_x", "position_y"),
+         ("x_position", "y_position"), ("lon", "lat"), ("longitude", "latitude"))  # fmt: skip
+ELLIPSES = 12  # of the claimed covariance along the path
+SIGMAS = 2.0
+
+
+def coordinates_of(states: Sequence[str]) -> tuple[int, int] | None:
+    """Return the places of two states that are a position in a plane, by their names; None where there are none."""
+    plain = [state.split("(")[0].strip().lower() for state in states]
+    for first, second in PAIRS:
+        if first in plain and second in plain:
+            return plain.index(first), plain.index(second)
+    return None
+
+
+@matplotlib.rc_context(STYLE)
+def map_figure(record: Record, node: str, names: Sequence[str]) -> Figure:
+    """Draw the paths that filters of a node estimate, with ellipses of two claimed deviations, and the true one."""
+    places = coordinates_of(record.states)
+    assert places is not None  # only then is a map drawn
+    i, j = places
+    figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
+    axes = figure.subplots()
+    for number, name in enumerate(names):
+        estimate, colour = record.estimates[node][name], colour_of(number)
+        mean = np.asarray(estimate.mean)
+        axes.plot(mean[:, i], mean[:, j], color=colour, linewidth=1.2, label=in_figure(name))
+        if estimate.claim != "none":
+            for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
+                _add_ellipse(axes, mean[k, [i, j]], np.asarray(estimate.covariance)[k][np.ix_([i, j], [i, j])], colour)
+    if record.truth is not None:
+        axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(with_unit(record.states[i], record.units))
+    axes.set_ylabel(with_unit(record.states[j], record.units))
+    legend_above(figure, axes)
+    return figure
+
+
+def _add_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
+    """Add the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2; nothing where P is no covariance."""
+    if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
+        return
+    values, vectors = np.linalg.eigh(covariance)
+    if values[0] < 0:
+        return
+    width, height = 2 * SIGMAS * np.sqrt(values[::-1])
+    angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+    axes.add_patch(Ellipse((center[0], center[1]), width, height, angle=angle, color=colour, alpha=0.2, linewidth=0))

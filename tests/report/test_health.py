@@ -1,0 +1,96 @@
+"""What is said of outputs: each by itself, what a filter used, what is stuck, what innovations cannot tell."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.report.health import examine
+from heliograph.report.held import held_value
+
+PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0, states=["x"])
+SENSOR = hg.LinearSensor([[1.0]], 1.0, outputs=["y"])
+STEPS = 1500
+
+
+def health_of(network, measurements):
+    rows = len(next(iter(measurements.values())))
+    return examine(network, hg.run(network, measurements), np.zeros((rows, 0)))
+
+
+def test_outliers_that_a_gate_refused_do_not_count_against_it():
+    """5 % outliers of deviation 50 make the mean square of all innovations some 90, of those that were used 1."""
+    rng = np.random.default_rng(0)
+    x = np.cumsum(0.1 * rng.standard_normal(STEPS))
+    y = x + rng.standard_normal(STEPS) + 50 * rng.standard_normal(STEPS) * (rng.random(STEPS) < 0.05)
+    gate = hg.robust_filter(PLANT, SENSOR, hg.perfect(), hg.filters.Gate(16.0))
+    network = hg.Network(PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"gate": gate})})
+    health = health_of(network, {"a": y[:, None]})
+    judged = health.outputs[0].judged
+    assert judged.summary.squared > 50 and abs(judged.size - 1) < 4 * judged.size_error < 0.3
+    assert not any("too sure" in line for line in health.warnings())
+
+
+def test_each_output_is_judged_by_itself():
+    """One output 2.6 times, another a third of what is claimed: their mean is near 1 and says nothing."""
+    rng = np.random.default_rng(1)
+    sensor = hg.LinearSensor([[1.0], [1.0]], np.eye(2), outputs=["wheel", "gnss"])
+    x = np.cumsum(0.1 * rng.standard_normal(STEPS))
+    y = x[:, None] + rng.standard_normal((STEPS, 2)) * np.sqrt([0.3, 1.75])
+    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(2), {"k": hg.kalman_filter(PLANT, sensor)})})
+    health = health_of(network, {"a": y})
+    assert abs(health.filters[0].test.power - 1) < 0.1
+    sure, large = health.warnings()
+    assert sure.startswith("a/k is too sure of gnss: ") and large.startswith("a/k expects more of wheel than comes: ")
+
+
+def test_a_sensor_that_is_stuck_is_named_and_others_are_not():
+    rng = np.random.default_rng(2)
+    x = np.cumsum(0.1 * rng.standard_normal(STEPS))
+    z = {name: x[:, None] + rng.standard_normal((STEPS, 1)) for name in ("good", "bad")}
+    z["bad"][700:1100] = z["bad"][700]
+    nodes = {name: hg.Node(SENSOR, hg.perfect(), {"k": hg.kalman_filter(PLANT, SENSOR)}) for name in z}
+    (line,) = health_of(hg.Network(PLANT, nodes), z).warnings()
+    assert line.startswith("bad: y is stuck, or has no noise: 400 equal values in a row") and "from row 701" in line
+
+
+def test_coarse_readings_of_what_rests_are_not_stuck():
+    """A reading of resolution 2 with noise of deviation .1 repeats by itself; one of resolution .1 with 1 does not."""
+    rng = np.random.default_rng(3)
+    coarse = np.round(0.1 * rng.standard_normal(500) / 2) * 2
+    coarse[250:] += 2
+    assert held_value(coarse, np.full(500, 0.01)) is None
+    fine = np.round(rng.standard_normal(5000), 1)
+    assert held_value(fine, np.full(5000, 1.0)) is None
+    fine[40:52] = 0.3
+    held = held_value(fine, np.full(5000, 1.0))
+    assert held is not None and held.readings >= 12 and held.first_row <= 40
+
+
+def test_what_rests_and_has_no_noise_has_a_page():
+    """All innovations zero: there is nothing to test, and it is said why."""
+    network = hg.Network(PLANT, {"odom": hg.Node(SENSOR, hg.perfect(), {"k": hg.kalman_filter(PLANT, SENSOR)})})
+    health = health_of(network, {"odom": np.zeros((200, 1))})
+    (line,) = health.warnings()
+    assert "all 200 values are 0" in line and health.filters[0].test is None
+
+
+def test_noise_of_one_side_is_no_bias():
+    """The median of noise that is late by an exponential law lies below its mean; the world is the model's own."""
+    law = hg.Contaminated.one_sided(0.01, 0.2, 2.0)
+    sensor = hg.LinearSensor([[1.0]], law, outputs=["y"])
+    filters = {"score": hg.robust_filter(PLANT, sensor, hg.perfect())}
+    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), filters)})
+    z = hg.monte_carlo(network, STEPS, 1, key=0).measurements["a"][0]
+    summary = health_of(network, {"a": z}).outputs[0].judged.summary
+    assert summary.bias_low < 0 < summary.bias_high
+
+
+@pytest.mark.parametrize("size", [0.12, 1.0])
+def test_small_innovations_do_not_make_a_filter_cautious(size):
+    """A slow error of the sensor leaves small innovations: the page says that they cannot tell."""
+    rng = np.random.default_rng(4)
+    y = 0.3 * rng.standard_normal(STEPS) if size < 1 else rng.standard_normal(STEPS)
+    plant = hg.LinearPlant([[1.0]], 1e-4, [0.0], 1e-2, states=["x"])
+    network = hg.Network(plant, {"a": hg.Node(SENSOR, hg.perfect(), {"k": hg.kalman_filter(plant, SENSOR)})})
+    lines = health_of(network, {"a": y[:, None]}).warnings()
+    assert (len(lines) == 1 and "Innovations cannot tell the two apart" in lines[0]) if size < 1 else lines == []
