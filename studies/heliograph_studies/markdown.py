@@ -48,10 +48,11 @@ from heliograph_studies.statement import Rule, Sampled, Statement, Verdict
 
 SAID: Mapping[Verdict, tuple[str, str]] = {
     "fails": ("fails", "fail"),
+    "does_not_apply": ("does not apply here", "do not apply here"),
     "holds_vacuously": ("is true but empty", "are true but empty"),
     "holds": ("holds", "hold"),
 }
-EMPTY = "**True but empty**: it would be so without any measurement, or what it presupposes is not met."
+EMPTY = "**True but empty**: it would be so without any measurement."
 PICTURE = re.compile(r"!\[(.*)\]\((\w+)\)", re.DOTALL)
 EVIDENCE = re.compile(r"([\w.]+) = (.*)")
 COLOURED = re.compile(r"(#[0-9a-f]{6})\s+(.*)", re.DOTALL)
@@ -193,7 +194,7 @@ def _table(node: SyntaxTreeNode) -> Table:
 
 
 def verdicts(statements: Sequence[Statement]) -> list[Block]:
-    """How many there are of each verdict, and all of them: those that fail first."""
+    """How many there are of each verdict, and all of them, in the order of the publication."""
     text = f"Judged by the numbers of this very run: {counted(statements, '**')}."
     empty = any(statement.verdict == "holds_vacuously" for statement in statements)
     judged = [
@@ -204,7 +205,15 @@ def verdicts(statements: Sequence[Statement]) -> list[Block]:
 
 
 def counted(statements: Sequence[Statement], strong: str = "") -> str:
-    """How many statements there are, and how many of each verdict."""
-    count = Counter(statement.verdict for statement in statements)
+    """How many statements the publication makes, by verdict; how many are added here, and how many of those hold."""
+    papers = [statement for statement in statements if statement.in_paper]
+    count = Counter(statement.verdict for statement in papers)
     parts = [f"{count[verdict]} {words[count[verdict] > 1]}" for verdict, words in SAID.items() if count[verdict]]
-    return f"of {len(statements)} statements {strong}{', '.join(parts)}{strong}"
+    noun = "statement" if len(papers) == 1 else "statements"
+    text = f"of {len(papers)} {noun} of the paper {strong}{', '.join(parts)}{strong}"
+    ours = [statement for statement in statements if not statement.in_paper]
+    if not ours:
+        return text
+    true = sum(statement.verdict == "holds" for statement in ours)
+    added = f"of {len(ours)} that the paper does not make and are tried here, {true} hold{'s' if true == 1 else ''}"
+    return f"{text}; {added}" if papers else added

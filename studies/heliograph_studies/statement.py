@@ -9,7 +9,8 @@ import numpy as np
 
 from heliograph.report.results import Json
 
-Verdict = Literal["holds", "holds_vacuously", "fails"]
+Verdict = Literal["holds", "holds_vacuously", "does_not_apply", "fails"]
+OURS = "not in the paper"  # the source of a statement that this page adds
 
 SIGNIFICANT = 3.0  # standard errors: what differs by less may be sampling
 
@@ -55,9 +56,15 @@ class Statement(NamedTuple):
     def verdict(self) -> Verdict:
         """What follows from the evidence.
 
-        "holds_vacuously": true, but so it would be without any measurement, or its premise is never met.
+        "holds_vacuously": true, but so it would be without any measurement.
+        "does_not_apply": what it presupposes is not met here, so that nothing here speaks for it or against it.
         """
         return self.judged()
+
+    @property
+    def in_paper(self) -> bool:
+        """Whether the publication says it; what this page adds is judged too, and not counted among its statements."""
+        return not self.source.startswith(OURS)
 
     def judged(self, **other: "float | Sampled") -> Verdict:
         """The verdict that would follow if some of the evidence were other."""
@@ -76,9 +83,14 @@ def holds(condition: bool | np.bool) -> Verdict:
     return "holds" if condition else "fails"
 
 
-def if_met(premise: bool | np.bool) -> Verdict:
-    """ "holds" for a theorem whose premise is met here, else "holds_vacuously"."""
-    return "holds" if premise else "holds_vacuously"
+def unless_empty(says_something: bool | np.bool) -> Verdict:
+    """ "holds" for what says something here, else "holds_vacuously"."""
+    return "holds" if says_something else "holds_vacuously"
+
+
+def if_applies(premise: bool | np.bool, condition: bool | np.bool) -> Verdict:
+    """ "holds" or "fails" where the premise is met, else "does_not_apply"."""
+    return holds(condition) if premise else "does_not_apply"
 
 
 def vacuous(condition: bool | np.bool, anyway: bool | np.bool) -> Verdict:
@@ -104,6 +116,6 @@ class Rule:
 
 
 VERDICTS: Mapping[str, object] = {
-    **{"holds": holds, "if_met": if_met, "vacuous": vacuous, "__builtins__": {}},
+    **{"holds": holds, "unless_empty": unless_empty, "if_applies": if_applies, "vacuous": vacuous, "__builtins__": {}},
     **{function.__name__: function for function in (abs, all, iter, max, min, zip)},
 }

@@ -159,7 +159,8 @@ class Study(Generic[Setting, Outcome]):
         constants = {
             name: value for name, value in vars(sys.modules[self.figures.__module__]).items() if name.isupper()
         }
-        words = {"setting": setting, "command": self.command(setting), **self.words(outcome)}
+        example = "an example with other numbers than the paper's" if self._changed(setting) else "the paper's example"
+        words = {"setting": setting, "command": self.command(setting), "the_example": example, **self.words(outcome)}
         return constants | {name: getattr(outcome, name) for name in vars(outcome)} | words
 
     def _changed(self, setting: Setting) -> dict[str, tuple[str, str]]:

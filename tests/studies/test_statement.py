@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from heliograph_studies.statement import Sampled, Statement, holds, if_met, vacuous
+from heliograph_studies.statement import Sampled, Statement, holds, if_applies, unless_empty, vacuous
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,10 @@ def test_what_is_no_number_supports_nothing():
 
 def test_verdicts():
     assert (holds(True), holds(False)) == ("holds", "fails")
-    assert (if_met(True), if_met(False)) == ("holds", "holds_vacuously")
+    assert (if_applies(True, True), if_applies(True, False), if_applies(False, False)) == (
+        "holds", "fails", "does_not_apply"
+    )  # fmt: skip
+    assert (unless_empty(True), unless_empty(False)) == ("holds", "holds_vacuously")
     assert (vacuous(True, True), vacuous(True, False), vacuous(False, True)) == ("holds_vacuously", "holds", "fails")
 
 

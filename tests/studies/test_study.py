@@ -191,13 +191,13 @@ def test_it_is_written_and_said(study, tmp_path, capsys):
     assert summary_["claims"][0]["verdict"] == "fails"
     html = (folder / "report.html").read_text().partition("<body>")[2]
     order = ["A study", "It is 1.30", "Lead of 0.3.", "What differs from the publication", "<code>noise.mean</code>",
-             "A caption that goes on.", "0.65", "of 1 statements <strong>1 fails</strong>", "it is large",
+             "A caption that goes on.", "0.65", "of 1 statement of the paper <strong>1 fails</strong>", "it is large",
              "heliograph reproduce number --out out --runs 10 --seed 0 --set noise.mean=0.3", "The end."]  # fmt: skip
     assert [html.index(text) for text in order] == sorted(html.index(text) for text in order)
     assert capsys.readouterr().out.splitlines() == [
         "It is 1.30",
         "- half: 0.65 m (of the total)",
-        "Judged by this run: of 1 statements 1 fails.",
+        "Judged by this run: of 1 statement of the paper 1 fails.",
         f"Report: {folder / 'report.html'}",
     ]
     assert not (tmp_path / "out" / "number.stages").exists()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-VERDICTS = {"fails": "fails", "holds_vacuously": "true but empty", "holds": "holds"}
+VERDICTS = {"fails": "fails", "does_not_apply": "does not apply", "holds_vacuously": "true but empty", "holds": "holds"}
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,10 @@ class Judged:
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements with their verdicts, readable at any width; failures come first."""
+    """Statements with their verdicts, in the order of the publication, readable at any width."""
 
     statements: Sequence[Judged]
     kind: str = "statements"
-
-    @property
-    def judged(self) -> list[Judged]:
-        """Sort statements by verdict, else in their original order."""
-        return sorted(self.statements, key=lambda statement: list(VERDICTS).index(statement.verdict))
 
 
 @dataclass(frozen=True)

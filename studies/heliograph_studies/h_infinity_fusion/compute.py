@@ -90,7 +90,7 @@ def numbers(result: Parts) -> dict[str, Any]:
     """What the summary lists."""
     runs, growth, true, levels = result.runs, result.growth, result.true_growth, result.setting.levels
     decodable = runs.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
-    gaps = {other: result.difference("dynamic", other) for other in ("static", "static_p41")}
+    gaps = {other: result.difference("dynamic", other) for other in ("static", "static_odd")}
     return {
         "nodes": [_node(node, level, result) for node, level in zip(result.nodes, levels, strict=True)],
         "fusion": {

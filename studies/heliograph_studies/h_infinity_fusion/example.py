@@ -17,7 +17,7 @@ from heliograph_studies.h_infinity_fusion.worst_disturbance import World, Worst,
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
 QUANTIZERS = "none", "dynamic", "static"
-MORE_QUANTIZERS = "dynamic_decodable", "static_p41"  # of the paper's filters only
+MORE_QUANTIZERS = "dynamic_decodable", "static_odd"  # of the paper's filters only
 
 
 def zoom(setting: Setting) -> ZoomQuantizer:
@@ -26,14 +26,14 @@ def zoom(setting: Setting) -> ZoomQuantizer:
 
 
 def quantizers(setting: Setting) -> dict[str, Quantizer | None]:
-    """All of them by name."""
-    odd, size = setting.segments + 1, setting.amplitude
+    """All of them by name; `static_odd` and what can be decoded have one level more where the paper's are even."""
+    odd, size = setting.segments | 1, setting.amplitude  # of levels: with an odd number zero is one
     return {
         "none": None,
         "dynamic": zoom(setting),
         "static": hg.fusion.UniformQuantizer(setting.segments, size),
         "dynamic_decodable": hg.fusion.EscapeQuantizer(odd, size, setting.decay, 0.6, 1e-3),
-        "static_p41": hg.fusion.UniformQuantizer(odd, size),
+        "static_odd": hg.fusion.UniformQuantizer(odd, size),
     }
 
 

@@ -6,6 +6,7 @@ made-up numbers in place of the second example.
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,6 +184,11 @@ def test_losses_are_read_off_what_was_received(outcome):
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
     answer = example.violation(SETTING, 0, nodes[0].horizon)
     assert answer.level - 4 * answer.standard_error > nodes[0].horizon.level
+    # The page of errata says these numbers, and those of the second example.
+    errata = (Path(__file__).parents[3] / "docs" / "errata.md").read_text(encoding="utf-8")
+    assert f"node 1 has {answer.level:.5f} where its smallest level, {nodes[0].horizon.level:.5f}" in errata
+    designs = discriminating.design()
+    assert f"({designs['horizon']['1'].level:.2f} against {designs['zero_gain']['1'].level:.2f})" in errata
 
 
 @pytest.fixture(scope="module")
