@@ -16,7 +16,9 @@ class ServeOptions:
 
     window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0
     ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0
-    leap: Annotated[float | None, Parameter(help="How much later than all before it; any, unless given.")] = None
+    leap: Annotated[float, Parameter(help="How much later than all before it without a second that confirms it.")] = (
+        10_000.0
+    )
     store: Annotated[
         str | None,
         Parameter(
@@ -51,7 +53,7 @@ class ServeOptions:
         from heliograph.serving.running import ServiceSettings, name_of, of_node, store_of
 
         broker = None if self.broker is None else address(self.broker)
-        options = Options(self.window, self.ahead, float("inf") if self.leap is None else self.leap)
+        options = Options(self.window, self.ahead, self.leap)
         store = store_of(reference, self.store, self.parts, self.node)
         network, module = load_module(reference)
         settings = ServiceSettings(

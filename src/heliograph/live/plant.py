@@ -1,12 +1,14 @@
 """One plant of a fleet: its rows, the verdict on each message, and the counts of its links."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from heliograph.live.event import Known, Verdict
 from heliograph.live.rows import HeldRow, Key, Rows
+
+Position: TypeAlias = tuple[int, int, float, int, float]  # of a node's running count: first, newest, at, lost, latest
 
 
 @dataclass
@@ -67,6 +69,36 @@ class Link:
         elif sequence < self.newest:
             self.lost -= self.lost > 0  # it had only been overtaken
 
+    @property
+    def position(self) -> Position:
+        """Return where the running count stands."""
+        return self.first, self.newest, self.at, self.lost, self.latest
+
+    def withdraw(self, sequence: int, time: float, before: Position | None) -> None:
+        """Count a message of a wrong clock, which was used, as one from the future; `before`: the position before."""
+        self.used -= self.newest == sequence
+        self.first, self.newest, self.at, self.lost, self.latest = before or Link().position
+        self.count("future", sequence, time)
+
+
+class Leap(NamedTuple):
+    """A leap in time of which one message speaks: its time, the newest arrival before it, and the counts before it.
+
+    Any later message of that time or after it confirms it. One that goes on from before it contradicts it.
+    """
+
+    time: float
+    now: float
+    links: dict[str, Position]
+
+
+class Withdrawn(NamedTuple):
+    """An event that was used until a later one showed that its clock is wrong."""
+
+    node_index: int
+    sequence: int
+    time: float
+
 
 # A row that took an event, with its numbers and events before; None if the row is new.
 Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
@@ -86,6 +118,8 @@ class Plant:
         forced: number of rows that became final early, for lack of room.
         links: counts of the messages, by node.
         changes: changes since the last finalisation, for `undo`.
+        leap: a leap in time that no second message has confirmed; None if there is none.
+        contradicted: times of leaps that were contradicted, whose rows go at the next finalisation.
     """
 
     name: str
@@ -97,6 +131,65 @@ class Plant:
     forced: int = 0
     links: dict[str, Link] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
+    leap: Leap | None = None
+    contradicted: list[float] = field(default_factory=list)
+
+    @property
+    def confirmed(self) -> float:
+        """Return the newest arrival of which more than one message, or another clock, speaks."""
+        return self.now if self.leap is None else self.leap.now
+
+    @property
+    def clock(self) -> tuple[float, Leap | None]:
+        """Return the newest arrival, and a leap to it that nothing has confirmed."""
+        return self.now, self.leap
+
+    @clock.setter
+    def clock(self, clock: tuple[float, Leap | None]) -> None:
+        """Set the newest arrival and the leap to what they were; nothing is contradicted."""
+        self.now, self.leap = clock
+        self.contradicted = []
+
+    def pass_time(self, time: float, now: float, most: float, sure: bool, names: Sequence[str]) -> None:
+        """Let time pass to `now` by an event at `time`; more than `most` at once is a leap, unless it is sure.
+
+        Args:
+            time: time of the event.
+            now: its arrival.
+            most: longest gap that needs no second message.
+            sure: whether another clock says the same.
+            names: names of the nodes in their order, then that of the inputs.
+        """
+        leap, before = self.leap, self.confirmed
+        if leap is not None and not sure and (time == leap.time or time <= before):
+            return  # of the same message, or of the same moment; or late, which says nothing of now
+        if leap is not None and now < leap.time - most:
+            self.contradict(names)
+        elif leap is not None:
+            before = self.now
+        positions = {node: link.position for node, link in self.links.items()}
+        self.leap = Leap(time, before, positions) if now > before + most and not sure else None
+        self.now = max(before, now)
+
+    def contradict(self, names: Sequence[str]) -> None:
+        """Take back a leap: its rows go with the next finalisation, and counts and time are what they were."""
+        assert self.leap is not None
+        for row in self.rows.held[1:]:
+            for node, sequence, time in row.events if row.key[0] == self.leap.time else ():
+                self.link(names[node]).withdraw(sequence, time, self.leap.links.get(names[node]))
+        self.contradicted.append(self.leap.time)
+        self.now, self.leap = self.leap.now, None
+
+    def withdraw(self) -> tuple[list[Withdrawn], list[int]]:
+        """Remove the rows of contradicted leaps; return their events, and their slots."""
+        rows = [row for row in self.rows.held[1:] if row.key[0] in self.contradicted]
+        self.contradicted = []
+        for row in rows:
+            index = self.rows.index(row.key)
+            self.rows.remove(index)
+            if index < len(self.rows.held):
+                self.dirty = index if self.dirty is None else min(self.dirty, index)
+        return [Withdrawn(*name) for row in rows for name in row.events], [row.slot for row in rows]
 
     def take(self, event: Known, key: Key, slot: Callable[[], int], width: int) -> None:
         """Add an event to the row with its key, or to a new row in a slot of its own; record the change for `undo`."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import Link, Plant
+from heliograph.live.plant import Leap, Link, Plant
 from heliograph.live.rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
@@ -54,7 +54,7 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     links = {node: list(vars(link).values()) for node, link in plant.links.items()}
     names = [(i, *name) for i, row in enumerate(rows) for name in row.events]
     return _joined(
-        {"now": plant.now, "forced": plant.forced, "origin": origin, "links": links},
+        {"now": plant.now, "forced": plant.forced, "origin": origin, "links": links, "leap": plant.leap},
         [number for row in rows for number in row.key[1:]],
         [number for i, node, sequence, _ in names for number in (i, node, sequence)],
         fleet.pool.table[[row.slot for row in rows]].ravel(),
@@ -85,7 +85,8 @@ def plant_from(name: str, data: bytes, fleet: Fleet) -> Plant:
     held.hold(rows)
     links = {node: Link(*numbers) for node, numbers in head["links"].items()}
     origin = head["origin"] and datetime.fromisoformat(head["origin"])
-    return Plant(name, held, head["now"], origin, forced=head["forced"], links=links)
+    leap = None if head["leap"] is None else Leap(*head["leap"])
+    return Plant(name, held, head["now"], origin, forced=head["forced"], links=links, leap=leap)
 
 
 def _row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:

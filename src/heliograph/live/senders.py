@@ -64,10 +64,7 @@ class LossChain(NamedTuple):
         if not count:
             return 1.0
         moved = np.linalg.matrix_power(self.transition, apart)
-        law = self.initial * self.loss
-        for _ in range(count - 1):
-            law = (law @ moved) * self.loss
-        return float(law.sum())
+        return float((self.initial * self.loss @ np.linalg.matrix_power(moved * self.loss, count - 1)).sum())
 
 
 def sender_status(trigger: AbstractTrigger, losses: LossChain, last: int | None, final: int, now: int) -> SenderStatus:
@@ -84,10 +81,10 @@ def missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, f
     Between two heartbeats the sender may have transmitted on an event that was lost too: then the next one is due
     later. So of the silent steps at least every `heartbeat` steps one transmission was.
     """
-    period = getattr(trigger, "period", None)
+    period: int | None = getattr(trigger, "period", None)
     if period is not None:
-        begun = final - silent + 1
-        return sum(1 for k in range(begun, final + 1) if k % period == getattr(trigger, "phase", 0))
+        phase: int = getattr(trigger, "phase", 0)
+        return (final - phase) // period - (final - silent - phase) // period
     first_due = int(last is None and silent > 0 and trigger.needs_reference)
     if trigger.heartbeat is None:
         return first_due

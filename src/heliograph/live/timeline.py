@@ -99,7 +99,7 @@ class Timeline:
         if what := self._lanes.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot to look ahead in.
-        self._fleet = Fleet(self._lanes, Options(self.window, self.ahead, np.inf, self.capacity), alone=True)
+        self._fleet = Fleet(self._lanes, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
         self._plant, self._spare = self._fleet.begin("", start, None), self._fleet.pool.take()
         self._judges = Judges(self._fleet)
         self._finals = Finals(2 * self.capacity, self._lanes.step_rows.outputs.size)
@@ -151,8 +151,8 @@ class Timeline:
                 is counted, and everything stays as it was.
         """
         event, dropped, _ = self._fleet.within(node, self._known(node, sequence, time, values, arrival))
-        plant, before = self._plant, self._plant.now
-        verdict = self._fleet.take(plant, event)
+        plant, before = self._plant, self._plant.clock
+        verdict = self._fleet.take(plant, event, None if arrival is None else event.arrival)
         if verdict == "used":
             nothing = dropped and np.isnan(event.values).all()
             if nothing or self._refuses(event, plant.changes[-1][0]):
@@ -180,7 +180,7 @@ class Timeline:
 
     def advance(self, now: float) -> None:
         """Advance the time: what is older than the window becomes final."""
-        self._plant.now = max(self.now, moment("now", now))
+        self._fleet.advance(self._plant, moment("now", now))
         self._finalise()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
@@ -273,7 +273,7 @@ class Timeline:
         index, size = sizes[node]
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
-        came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
+        came = max(self._plant.confirmed, at) if arrival is None else moment(f"{name}, arrival", arrival)
         return Known(index, whole(f"{name}, sequence", sequence), at, numbers(name, values, size).tolist(), came)
 
     def _finalise(self) -> None:

@@ -2,7 +2,7 @@
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from time import perf_counter
@@ -13,7 +13,7 @@ from heliograph.live.fleet import Finalised
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
 from heliograph.live.lanes import Lanes as Lanes
-from heliograph.live.plant import Plant
+from heliograph.live.plant import Plant, Withdrawn
 from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.rows import HeldRow
 from heliograph.numerics.check import instance, shown
@@ -34,6 +34,8 @@ WHY: dict[Verdict, str] = {
     "future": "later than it can be: a clock is wrong",
     "implausible": "no filter could use it",
 }
+
+LEAPT = "a leap in time that no other message confirms: a clock is wrong; it had been used, and is taken back"
 
 
 class Taken(NamedTuple):
@@ -187,6 +189,8 @@ class Service:
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.messages(touched.values())
         finalised = self.fleet.finalise(touched.values())
+        withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
+        entries += [entry for plant, events in withdrawn for entry in self._withdrawn(plant, events)]
         entries += self._finals(finalised)
         provisional = self._provisional([row for row in finalised if row.plant.name in used])
         self.fleet.forget(finalised)
@@ -242,6 +246,13 @@ class Service:
         rows = [(row_set.plant, row) for row_set in finalised for row in row_set.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._lines(b"final", rows)))]
+
+    def _withdrawn(self, plant: Plant, events: Iterable[Withdrawn]) -> Iterator[Entry]:
+        """Yield a refusal of each event that was used before its clock turned out wrong."""
+        for node, sequence, time in events:
+            name = INPUTS if node < 0 else self.fleet.network.names[node]
+            parts = {"node": name, "sequence": sequence, "time": self._moment(plant, time)}
+            yield _refused(plant.name, parts, "future", LEAPT)
 
     def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
         """Return the provisional estimates at the newest rows, and what the senders' silence means."""

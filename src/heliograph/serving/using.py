@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Container, Sequence
 from datetime import UTC, datetime, time
-from math import floor
+from math import floor, inf
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.judging import Candidate, Judges
-from heliograph.live.plant import Link, Plant
+from heliograph.live.plant import Leap, Link, Plant, Withdrawn
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, seconds
 
@@ -25,7 +25,7 @@ class Before(NamedTuple):
     """State of a plant before a batch: whether it existed, its time and its counts."""
 
     known: bool
-    now: float
+    clock: tuple[float, Leap | None]
     links: dict[str, tuple[Any, ...]]
 
 
@@ -37,13 +37,16 @@ class Using:
         self._refused: dict[tuple[int, bool], str] = {}  # why, by the number of a message and whether it is its inputs
         self._before: dict[str, Before] = {}
         self._taken: list[Candidate] = []
+        self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
+        self.replaced: list[tuple[Plant, list[Withdrawn]]] = []  # these as they were, with their events
 
     def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str]) -> list[Outcome]:
         """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
 
         Afterwards the plants are as if the messages refused as implausible had never arrived.
         """
-        self._refused = self._implausible_inputs(messages)
+        self._refused, wall = self._implausible_inputs(messages), datetime.now(UTC)
+        self._anew, self.replaced = {}, []
         outcomes = [NOTHING] * len(messages)
         # One plant after another, so that its memory is near; the messages of a plant in their order.
         by_plant: dict[str, list[int]] = {}
@@ -58,7 +61,7 @@ class Using:
             for i in left:
                 try:
                     message = messages[i]
-                    outcomes[i] = (None, None, message, ()) if isinstance(message, str) else self._use(i, message)
+                    outcomes[i] = (None, None, message, ()) if isinstance(message, str) else self._use(i, message, wall)
                 except InputError as error:
                     outcomes[i] = None, None, str(error), ()
             self.fleet.step({plant.name: plant for _, plant, _, _ in self._taken}.values())
@@ -85,16 +88,19 @@ class Using:
         why = self._judges.implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
 
-    def _use(self, number: int, message: AnyMessage) -> Outcome:
+    def _use(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
         """Give a message to its plant; the outcome has none if the plant would begin with a refused message."""
-        plant = self.plants.get(message.plant)
+        plant = self._going_on(message, wall)
         # A new plant begins with a message that is plausible and of a right clock.
         origin = self._origin(message) if plant is None else plant.origin
         at = message.time
         if origin is not None or not isinstance(at, float):
             at = self._number(at, origin, message.plant)
-        now = at if plant is None else plant.now
+        now = at if plant is None else plant.confirmed
         arrival = max(now, at) if message.arrival is None else self._number(message.arrival, origin, message.plant)
+        clock = None if message.arrival is None else arrival
+        if clock is None and origin is not None:
+            clock = self._number(wall, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
@@ -108,15 +114,15 @@ class Using:
             return None, "future", "", ()
         if plant is None and why and (inputs is None or spoilt):
             return None, "implausible", why, ()
-        plant = self._remembered(plant or self.fleet.begin(message.plant, at, origin), at)
+        plant = self._remembered(plant or self._begun(message.plant, at, origin), at)
         # Inputs and measurement are used or refused independently.
         notes: list[str] = []
         if inputs is not None and spoilt is None:
-            self._take(number, plant, inputs)
+            self._take(number, plant, inputs, clock)
         elif spoilt is not None:
             plant.link(INPUTS).implausible += 1
             notes.append(f"inputs {given}: {spoilt}; the rest is used")
-        verdict: Verdict = "implausible" if why else self._take(number, plant, event)
+        verdict: Verdict = "implausible" if why else self._take(number, plant, event, clock)
         link = plant.link(message.node)
         link.count(verdict, message.sequence, at)
         if dropped and verdict in ("used", "implausible"):
@@ -129,10 +135,10 @@ class Using:
         """Return the plant, and store once in a batch what it was before; a new one joins the others."""
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
-            self._before[plant.name] = Before(False, begun, {})
+            self._before[plant.name] = Before(False, (begun, None), {})
         elif plant.name not in self._before:
             links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
-            self._before[plant.name] = Before(True, plant.now, links)
+            self._before[plant.name] = Before(True, plant.clock, links)
         return plant
 
     def _number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
@@ -140,17 +146,50 @@ class Using:
         at, step = seconds(moment, origin, plant), self.fleet.options.step
         return at if origin is None or step is None else floor(at / step + 0.5)
 
-    def _take(self, number: int, plant: Plant, event: Known) -> Verdict:
-        verdict = self.fleet.take(plant, event)
+    def _going_on(self, message: AnyMessage, wall: datetime) -> Plant | None:
+        """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
+
+        That is so where the only moment it has had is contradicted by an earlier one, and where it is in the future of
+        the clock on the wall, with which the message agrees.
+        """
+        plant, leap = self.plants.get(message.plant), self.fleet.options.leap
+        if plant is None or isinstance(message.time, datetime) != (plant.origin is not None):
+            return plant
+        at = self._number(message.time, plant.origin, plant.name)
+        if plant.leap is not None and plant.leap.now == -inf and at < plant.now - leap:
+            return None
+        if plant.origin is not None:
+            clock = self._number(wall, plant.origin, plant.name)
+            if plant.confirmed > clock + leap and abs(at - clock) <= leap:
+                return None
+        return plant
+
+    def _begun(self, name: str, at: float, origin: datetime | None) -> Plant:
+        """Begin a plant, whose first moment is not sure yet; one that begins anew is withdrawn."""
+        plant, old = self.fleet.begin(name, at, origin), self.plants.pop(name, None)
+        plant.now, plant.leap, plant.version = at, Leap(at, -inf, {}), self._anew.get(name, 0)
+        if old is not None:
+            plant.version = self._anew[name] = old.version
+            events = [Withdrawn(*event) for row in old.rows.held for event in row.events]
+            self.replaced.append((old, events))
+            for node, sequence, time in events:
+                plant.link(INPUTS if node < 0 else self.fleet.network.names[node]).count("future", sequence, time)
+            self._before.pop(name, None)
+            self._taken = [taken for taken in self._taken if taken[1] is not old]
+            self.fleet.end(old)
+        return plant
+
+    def _take(self, number: int, plant: Plant, event: Known, clock: float | None) -> Verdict:
+        verdict = self.fleet.take(plant, event, clock)
         if verdict == "used":
             self._taken.append((number, plant, event, plant.changes[-1][0]))
         return verdict
 
     def _undo(self, name: str) -> None:
         """Restore a plant to its state before the batch."""
-        plant, (known, now, links) = self.plants[name], self._before[name]
+        plant, (known, clock, links) = self.plants[name], self._before[name]
         if known:
-            self.fleet.undo(plant, now)
+            self.fleet.undo(plant, clock)
             plant.links = {name: Link(*counts) for name, counts in links.items()}
         else:
             self.fleet.end(self.plants.pop(name))

@@ -1,0 +1,162 @@
+"""The table of the rows of all plants, and the steps between rows: due rows are stepped for all plants at once."""
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from heliograph.live.lanes import Lanes
+from heliograph.live.later import History
+from heliograph.live.long_gap import LONG, TAIL, states_after
+from heliograph.live.rows import HeldRow
+from heliograph.numerics.types import Float
+
+FEWEST = 1024  # rows of the table at first; it doubles when it is full
+SHORTEST = 64  # rows of a history
+
+
+class Pool:
+    """Table with one row per slot; slots are taken and given back.
+
+    The columns are (state, outputs, inputs held, step number, received, inputs, time). `numbers` is the slice of the
+    last three, as in the rows of a timeline. `alone`: single rows are stepped, not many at once.
+    """
+
+    def __init__(self, lanes: Lanes, alone: bool = False):
+        self.lanes, self.step_rows, self._alone = lanes, lanes.step_rows, alone
+        sizes = self.step_rows.state.size, self.step_rows.outputs.size
+        ends = np.cumsum([*sizes, lanes.given, 1, lanes.received + lanes.given + 1])
+        self.state, self.outputs, self.held, self.at, self.numbers = (
+            slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
+        )
+        self.table = np.zeros((FEWEST, int(ends[-1])))
+        self._free = list(range(FEWEST - 1, -1, -1))
+
+    @property
+    def used(self) -> int:
+        """Return how many slots are taken."""
+        return len(self.table) - len(self._free)
+
+    def take(self) -> int:
+        """Take a free slot."""
+        if not self._free:
+            count = len(self.table)
+            self.table = np.concatenate([self.table, np.zeros_like(self.table)])
+            self._free = list(range(2 * count - 1, count - 1, -1))
+        return self._free.pop()
+
+    def give(self, slots: list[int]) -> None:
+        """Give slots back."""
+        self._free += slots
+
+    def start(self, slot: int, time: float) -> None:
+        """Fill a slot with the prior, at `time`, before any measurement."""
+        row = self.table[slot]
+        row[:] = 0.0
+        row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, -1.0, np.nan
+        row[-1] = time
+
+    def trial(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
+        """Predict from the rows in these slots, with these inputs and no measurement; return the outputs.
+
+        The prediction covers one step, or one unit of continuous time. An input that is NaN keeps its value. The step
+        number is at most `last`.
+        """
+        dt, table = self.lanes.dt, self.table
+        u = np.where(np.isnan(given), table[before, self.held], given)
+        u = u if dt is None else _with_time_step(u, dt, np.ones(len(u)))
+        k = np.minimum(table[before, self.at.start] + 1, last)
+        nothing = np.full((len(before), self.lanes.received), np.nan)
+        done = self.step_rows(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1), self._alone)
+        return done[:, self.step_rows.state.size :]
+
+    def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
+        """Step from the rows in the slots `before` into those in `after`; `at`: the step number in discrete time.
+
+        In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
+        received at the last of these.
+        """
+        dt, table = self.lanes.dt, self.table
+        numbers, held = table[after, self.numbers], table[before, self.held]
+        received, given = numbers[:, : self.lanes.received], numbers[:, self.lanes.received : -1]
+        now_held = np.where(np.isnan(given), held, given)
+        if dt is None:
+            there = (at == numbers[:, -1])[:, None]
+            received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
+            now_held, k = u, at
+        else:
+            u = _with_time_step(held, dt, numbers[:, -1] - table[before, -1])
+            k = table[before, self.at.start] + 1
+        done = self.step_rows(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1), self._alone)
+        table[after, : self.outputs.stop] = done
+        table[after, self.held], table[after, self.at.start] = now_held, k
+
+    def jump(self, slot: int, to: int) -> None:
+        """Take the row in a slot, in place, to step number `to` without measurements, in bounded work."""
+        row = self.table[slot]
+        at, held = int(row[self.at.start]), row[self.held]
+        nothing = np.full(self.lanes.received, np.nan)
+
+        def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+            rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))
+            rows = np.concatenate([states, rest], axis=1)
+            return self.step_rows(rows, self._alone and len(states) == 1)[:, : self.step_rows.state.size]
+
+        after = states_after(step, self.step_rows.start, row[self.state].copy(), at, to - at)
+        self.table[slot, self.state], self.table[slot, self.at.start] = after, to
+
+    def history(self, slots: Sequence[int]) -> History:
+        """Return the rows in these slots, in order, and behind them copies of the last up to a power of two."""
+        length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
+        rows, steps = self.table[[*slots, *[slots[-1]] * (length - len(slots))]], self.step_rows
+        state, outputs = steps.state.tree(rows[:, self.state]), steps.outputs.tree(rows[:, self.outputs])
+        return History(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start].astype(int), outputs)
+
+
+def _with_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:
+    """Insert the time steps among the inputs, as number `dt`."""
+    return np.concatenate([u[:, :dt], steps[:, None], u[:, dt:]], axis=1)
+
+
+Single: TypeAlias = tuple[int, int, float]  # a step: slot to step from, slot to step into, number
+
+
+class Leg(NamedTuple):
+    """Steps of a chain, and the step number to which the last row jumps behind them."""
+
+    steps: list[Single]
+    jump: int = 0
+
+
+def legs_of(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
+    """Cut the steps of a chain where a gap is too long to step through one by one.
+
+    Args:
+        chain: rows, of which each is stepped into from the one before it.
+        by_steps: whether time counts steps.
+        endless: whether the network is defined for all steps, so that silent steps are alike.
+    """
+    legs = [Leg([])]
+    for row, next_row in pairwise(chain):
+        begin, last, before = int(row.key[0]) + 1, next_row.key[0], row.slot
+        numbers: Sequence[float] = range(begin, int(last) + 1) if by_steps else (last,)
+        if len(numbers) > LONG and endless:
+            legs[-1] = Leg([*legs[-1].steps, (before, next_row.slot, begin)], int(last) - TAIL)
+            legs.append(Leg([]))
+            before, numbers = next_row.slot, range(int(last) - TAIL + 1, int(last) + 1)
+        for at in numbers:
+            legs[-1].steps.append((before, next_row.slot, at))
+            before = next_row.slot
+    return legs
+
+
+def rounds_of(walks: Iterable[list[Single]]) -> list[list[Single]]:
+    """Group the steps of all chains by turn, so that each group has at most one step of each chain."""
+    rounds: list[list[Single]] = []
+    for steps in walks:
+        for turn, step in enumerate(steps):
+            if turn == len(rounds):
+                rounds.append([])
+            rounds[turn].append(step)
+    return rounds
