@@ -253,6 +253,26 @@ def test_a_sender_that_is_slower_than_the_rows_loses_nothing():
     assert np.isclose(dated.period, 0.5) and dated.share == 197 / 200
 
 
+def test_another_share_of_losses_than_stated_is_a_doubt():
+    """Of 720 rows 75 % where 85 % is said, with a gap of 30; and no doubt where it is as said, in 200 recordings."""
+    rng, time = np.random.default_rng(0), np.arange(720.0)
+    there = rng.random(720) < 0.78
+    there[300:330] = False
+    assert Arrivals("a", "y", time, there, np.zeros(there.sum()), True, stated_share=0.85).contradicts(0.01)
+    false = 0
+    for _ in range(200):
+        there = rng.random(720) < 0.85
+        false += Arrivals("a", "y", time, there, np.zeros(there.sum()), True, stated_share=0.85).contradicts(0.01)
+    assert false <= 8  # 2 expected; more than 8 with probability 2e-4
+    link = hg.erasure(hg.perfect(), 0.85)
+    sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["y"])
+    plant = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0, states=["x"])
+    network = hg.Network(plant, {"a": hg.Node(sensor, link, {"k": hg.kalman_filter(plant, sensor)})})
+    z = np.where(rng.random(720) < 0.6, hg.monte_carlo(network, 720, 1, key=0).measurements["a"][0, :, 0], np.nan)
+    (line,) = examine(network, hg.run(network, {"a": z[:, None]}), np.zeros((720, 0))).warnings()
+    assert line.startswith("a: y arrived in ") and line.endswith("; the network says that 85.0% do")
+
+
 def test_several_rates_are_no_doubt():
     """A recording of the network's own world, rows at the stamps of two nodes with rates of their own."""
     plant = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0, states=["x"])

@@ -4,12 +4,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtri
 
+from heliograph.filters.innovation import independent_count
 from heliograph.numerics.types import Float
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
 REGULAR = 0.95  # least share of intervals that are whole periods
+LEAST_SHARE = 0.01  # difference from the stated share below which none is worth a warning
 SLOWER = 1.5  # rows between messages from which a sender is slower than the table
 
 
@@ -25,6 +28,7 @@ class Arrivals:
         values: those that arrived.
         may_be_lost: whether the network says that it may be lost, or is not always sent.
         declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
+        stated_share: probability of arrival by the network; None where it is not one number, as in bursts.
     """
 
     node: str
@@ -34,6 +38,7 @@ class Arrivals:
     values: np.ndarray
     may_be_lost: bool
     declared_period: int | None = None
+    stated_share: float | None = None
 
     @cached_property
     def period(self) -> float | None:
@@ -72,6 +77,18 @@ class Arrivals:
     def share(self) -> float:
         """Share of the messages that were due which arrived."""
         return min(float(self.arrived.sum()) / self.due, 1.0)
+
+    def contradicts(self, level: float) -> bool:
+        """Test at a level whether the share that arrived is another than the stated one, and by more than a hundredth.
+
+        Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a).
+        """
+        p = self.stated_share
+        if p is None or not 0 < p < 1:
+            return False
+        independent = self.due if self.period is not None else independent_count(self.arrived.astype(float))
+        deviation = np.sqrt(p * (1 - p) / independent)
+        return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
 
     @property
     def longest_gap(self) -> int:

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.model.over_time import first
+from heliograph.model.over_time import OverTime, first
 from heliograph.model.trigger import Periodic
+from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
+from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node
+from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
@@ -58,6 +60,8 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
+            elif link.contradicts(FALSE / len(self.links)):
+                lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
         return lines + [line for doubted in self.doubted() for line in self._doubts(doubted)]
 
     def held(self) -> dict[tuple[str, str], str]:
@@ -164,9 +168,11 @@ def examine(
         declared, may_be_lost = None, not receiver.complete
         if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
             declared, may_be_lost = receiver.trigger.period, first(receiver.channel).erases
+        shares = _stated_shares(receiver)
         for i, name in enumerate(receiver.received_names):
             there = ~np.isnan(z[:, i])
-            links.append(Arrivals(node, name, record.time, there, z[there, i], may_be_lost, declared))
+            stated = None if shares is None or i >= len(shares) else float(shares[i])
+            links.append(Arrivals(node, name, record.time, there, z[there, i], may_be_lost, declared, stated))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in listeners(network, record):
@@ -189,3 +195,17 @@ def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
         return None
     return memory_of(came, lags, claimed=True)
+
+
+def _stated_shares(receiver: Node | ReceivingNode) -> Float[np.ndarray, " received"] | None:
+    """Return the probability of arrival of each received number; None of a link whose losses remember or change."""
+    sends_always = isinstance(receiver, Node) and (receiver.trigger is None or isinstance(receiver.trigger, Periodic))
+    if not isinstance(receiver, Node) or not sends_always or isinstance(receiver.channel, OverTime):
+        return None
+    if receiver.channel.remembers or not receiver.channel.erases:
+        return None
+    try:
+        sets = outcomes(receiver.channel)
+    except InputError:  # more sets of losses than are listed
+        return None
+    return np.asarray(np.sum([float(o.probability) * o.arrived for o in sets], axis=0))

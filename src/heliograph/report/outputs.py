@@ -23,7 +23,7 @@ from heliograph.simulation.results.whiteness import correlated_mean
 class Errors(NamedTuple):
     """Errors of one filter: RMSE by state (NaN where its truth is not known), and NEES per state, 1 for a true claim.
 
-    `rmse_error` is the standard error of each RMSE, of errors that are correlated in time.
+    `rmse_error` and `nees_error` are the standard errors, of errors that are correlated in time.
 
     `claim` is what holds in all rows; `nees` is NaN where nothing is claimed.
     """
@@ -34,6 +34,7 @@ class Errors(NamedTuple):
     rmse: dict[str, float]
     rmse_error: dict[str, float]
     nees: float
+    nees_error: float
 
 
 def errors_of(record: Record) -> list[Errors]:
@@ -49,7 +50,9 @@ def errors_of(record: Record) -> list[Errors]:
             size = float(values[judged].sum() / known[judged].sum()) if judged.any() else np.nan
             claim = weakest(np.unique(estimate.claims).tolist())
             rmse = record.rmse(node, name)
-            results.append(Errors(node, name, claim, rmse, _rmse_errors(record, node, name, rmse), size))
+            per_state = values / np.where(known > 0, known, np.nan)
+            error = correlated_mean(per_state)[1] if judged.any() else np.nan
+            results.append(Errors(node, name, claim, rmse, _rmse_errors(record, node, name, rmse), size, error))
     return results
 
 

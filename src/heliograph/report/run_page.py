@@ -185,7 +185,7 @@ def errors_table(record: Record) -> list[Table]:
     rows = [
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
          *(rounded(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
-         "–" if np.isnan(errors.nees) else f"{errors.nees:.3g}"]
+         "–" if np.isnan(errors.nees) else rounded(errors.nees, errors.nees_error)]
         for errors in errors_of(record)
     ]  # fmt: skip
     # What the columns are, in words.
