@@ -19,6 +19,10 @@ class ServeOptions:
     leap: Annotated[float, Parameter(help="How much later than all before it without a second that confirms it.")] = (
         10_000.0
     )
+    every: Annotated[
+        float | None,
+        Parameter(help="Seconds after which a silent plant is published again; only what has changed, unless given."),
+    ] = None
     store: Annotated[
         str | None,
         Parameter(
@@ -69,6 +73,7 @@ class ServeOptions:
             sources=module.get("sources"),
             name=name_of(reference),
             accept_changes=self.accept_changes,
+            every=self.every,
         )
         return settings if self.node is None else of_node(settings, self.node)
 

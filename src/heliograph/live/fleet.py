@@ -106,7 +106,30 @@ class Fleet:
 
     def end(self, plant: Plant) -> None:
         """Remove a plant and free its slots."""
+        self.end_silence(plant)
         self.pool.give([row.slot for row in plant.rows.held])
+
+    def pass_silence(self, plants: Iterable[tuple[Plant, float]]) -> None:
+        """Predict each plant to a step at which nothing came; `silence` of the plant is the row there.
+
+        It goes on from the silence before, is no row of the history, and ends with the next event that is used.
+        """
+        chains = []
+        for plant, step in plants:
+            before = plant.silence or plant.rows.held[-1]
+            if step <= before.key[0]:
+                continue
+            slot = plant.silence.slot if plant.silence is not None else self.pool.take()
+            plant.silence = HeldRow((step, 0, 0), slot, self.width)
+            self.pool.table[slot, self.pool.numbers] = plant.silence.numbers
+            chains.append([before, plant.silence])
+        self._run(chains)
+
+    def end_silence(self, plant: Plant) -> None:
+        """Forget the silence of a plant."""
+        if plant.silence is not None:
+            self.pool.give([plant.silence.slot])
+            plant.silence = None
 
     def size(self, node: int) -> int:
         """Return how many numbers an event of the node with this index has."""
@@ -158,6 +181,7 @@ class Fleet:
         verdict = rows.verdict(event, key, now - self.options.window, self.options.ahead)
         if verdict != "used":
             return verdict
+        self.end_silence(plant)
         plant.take(event, key, self.pool.take, self.width)
         leap = self.options.leap
         sure = clock is not None and abs(event.arrival - clock) <= leap

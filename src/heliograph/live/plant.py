@@ -119,6 +119,7 @@ class Plant:
         links: counts of the messages, by node.
         changes: changes since the last finalisation, for `undo`.
         leap: a leap in time that no second message has confirmed; None if there is none.
+        silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
         contradicted: times of leaps that were contradicted, whose rows go at the next finalisation.
     """
 
@@ -132,6 +133,7 @@ class Plant:
     links: dict[str, Link] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     leap: Leap | None = None
+    silence: HeldRow | None = None
     contradicted: list[float] = field(default_factory=list)
 
     @property

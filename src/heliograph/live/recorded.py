@@ -62,7 +62,7 @@ def play(
     def look(until: float) -> None:
         while lag is not None and waiting and waiting[0] + lag < until:
             moment = heappop(waiting)
-            if lagged and lagged[-1][0] == moment:
+            if (lagged and lagged[-1][0] == moment) or moment > timeline.now:  # there already; of a wrong clock
                 continue
             timeline.advance(moment + lag)
             lagged.append((moment, timeline.lagged(min(timeline.now - moment, window))))

@@ -31,6 +31,11 @@ class Exchange:
         self._name = next(iter(nodes), "")
         self._node = nodes.get(self._name)
 
+    @property
+    def sends(self) -> bool:
+        """Return whether this is a node that sends messages to its neighbours."""
+        return self._node is not None
+
     def messages(self, plants: Iterable[Plant]) -> list[Output]:
         """Return the messages that the events taken since the last finalisation make due, after their steps."""
         if self._node is None:

@@ -16,7 +16,7 @@ from heliograph.files.sources import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import TINY, check_count, fail, scalar
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, word
@@ -148,6 +148,8 @@ class ServiceSettings:
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
         name: name of the network on the page.
         accept_changes: whether the plants of a store whose network has changed go on with what fits.
+        every: seconds after which the estimate of a plant whose senders are silent is published again although it has
+            hardly changed; None for never.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -165,8 +167,11 @@ class ServiceSettings:
     sources: object = None
     name: str = ""
     accept_changes: bool = False
+    every: float | None = None
 
     def __post_init__(self) -> None:
+        if self.every is not None:
+            scalar("--every", self.every, TINY)
         if self.snapshot is not None:
             if self.store is None:
                 raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
@@ -267,7 +272,8 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(lanes, settings.options._replace(step=step))
     store = _open_store(settings, fleet)
-    resumed, service = store.count() > 0, Service(fleet, store, _say)
+    resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every)
+    service.resume()
     try:
         with signals(stop):
             broker = settings.broker

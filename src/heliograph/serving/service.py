@@ -22,6 +22,7 @@ from heliograph.serving.estimate_writer import EstimateWriter, line
 from heliograph.serving.exchange import Exchange
 from heliograph.serving.message import AnyMessage, Message, Payload, read_messages
 from heliograph.serving.output import Output
+from heliograph.serving.silence import Silence, dead_by_plant
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
@@ -62,15 +63,23 @@ class Service:
         fleet: the plants of the network.
         store: where the state is committed.
         say: called once with a line of text, when the first message is refused as implausible.
+        every: seconds after which the estimate of a plant whose senders are silent is published again although it has
+            hardly changed; None for never.
     """
 
-    def __init__(self, fleet: Fleet, store: StoreProtocol, say: Callable[[str], None] | None = None):
+    def __init__(
+        self,
+        fleet: Fleet,
+        store: StoreProtocol,
+        say: Callable[[str], None] | None = None,
+        every: float | None = None,
+    ):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, in order of their newest message
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._writer, self._using = EstimateWriter(fleet.lanes), Using(fleet, self.plants)
-        self._exchange = Exchange(fleet, self._moment)
+        self._exchange, self._silence = Exchange(fleet, self._moment), Silence(fleet, every)
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
@@ -82,7 +91,7 @@ class Service:
         Without messages, time has passed: plants whose senders decide when to send are stepped to the present.
         """
         with no_collector():  # a batch makes many objects and no cycles, and a search would take a third of its time
-            outputs = self._take(payloads or self._silence(datetime.now(UTC)))
+            outputs = self._take(payloads) if payloads else self._nothing_came(datetime.now(UTC))
             # What a large batch made counts as old, and is searched for garbage once in a million messages.
             if len(payloads) > LARGE:
                 gc.freeze()
@@ -93,27 +102,46 @@ class Service:
                 gc.collect()
         return outputs
 
-    def _silence(self, now: datetime) -> list[Message]:
-        """Return that nothing came by now, for plants whose steps have dates: inputs that all stay as they were."""
-        results, step = list[Message](), self.fleet.options.step
-        if step is None or not self.fleet.deciding:
-            return results
-        # Plants of which the next step has begun.
-        for plant in self.plants.values():
-            last, nothing = int(plant.now), [None] * self.fleet.lanes.given
-            if plant.origin is not None and plant.origin + timedelta(seconds=step * (last + 1)) <= now:
-                results.append(
-                    Message.model_construct(
-                        plant=plant.name,
-                        node=INPUTS,
-                        sequence=last,
-                        time=now,
-                        values=nothing,
-                        inputs=None,
-                        arrival=None,
-                    )
-                )
-        return results
+    def resume(self) -> None:
+        """Load the stored plants of a network with senders that decide, whose silence goes on."""
+        if self.fleet.deciding and self.fleet.options.step is not None:
+            names = self.store.names()
+            for i in range(0, len(names), LARGE):
+                if self.fleet.pool.used < ROWS:
+                    self._load(names[i : i + LARGE])
+            self._silence.resume(self.plants)
+
+    def _nothing_came(self, now: datetime) -> list[Output]:
+        """Let time pass; what becomes final by that is committed, and silence itself, which the clock says, is not."""
+        if self._exchange.sends:  # each of its steps is a message to the neighbours
+            steps = self._steps(now)
+            return self._take(steps) if steps else []
+        due = self._silence.due(self.plants.values(), now)
+        for plant, step in due:
+            self.fleet.advance(plant, step)
+        finalised = self.fleet.finalise(plant for plant, _ in due)
+        changed = {row_set.plant.name: row_set.plant for row_set in finalised if row_set.left}
+        entries = [entry for row_set in finalised for entry in self._withdrawn(row_set.plant, row_set.withdrawn)]
+        entries += self._finals(finalised)
+        self.fleet.pass_silence(due)
+        rows = [(plant, plant.silence) for plant, _ in due if plant.silence is not None]
+        provisional = self._provisional(self._silence.worth_telling(rows)) if rows else []
+        self.fleet.forget(finalised)
+        try:
+            return (self._commit(changed, entries, 0) if changed else []) + provisional
+        except ConflictError:  # another process has them now
+            self._load(changed)
+            return []
+
+    def _steps(self, now: datetime) -> list[Message]:
+        """Return a message of inputs that all stay as they were for each plant of which another step has begun."""
+        nothing: list[float | None] = [None] * self.fleet.lanes.given
+        return [
+            Message.model_construct(
+                plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=nothing, inputs=None, arrival=None
+            )
+            for plant, step in self._silence.due(self.plants.values(), now)
+        ]
 
     def _take(self, payloads: Sequence[Payload]) -> list[Output]:
         begun = perf_counter()
@@ -139,10 +167,14 @@ class Service:
     def dead_senders(self) -> dict[str, int]:
         """Count the plants in memory that have a dead sender, by node whose sender decides when to send."""
         dead = dict.fromkeys(self.fleet.deciding, 0)
-        for plant in self.plants.values() if dead else ():
-            for node, status in self.fleet.senders(plant).items():
-                dead[node] += status.dead
+        for nodes in self.dead_by_plant().values():
+            for node in nodes:
+                dead[node] += 1
         return dead
+
+    def dead_by_plant(self) -> dict[str, list[str]]:
+        """Return the dead senders of each plant in memory that has one."""
+        return dead_by_plant(self.fleet, self.plants)
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
@@ -164,7 +196,8 @@ class Service:
 
     def _taken(self, messages: Sequence[AnyMessage | str], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
         """Use messages and commit; return the outputs to publish, and the seconds of the commit."""
-        entries, malformed, known, outcomes = list[Entry](), 0, 0, self._using.use(messages, self._damage)
+        entries, malformed, known = list[Entry](), 0, 0
+        outcomes = self._using.use(messages, self._damage, datetime.now(UTC))
         touched = {plant.name: plant for plant, _, _, _ in outcomes if plant is not None}
         used = {plant.name for plant, verdict, _, _ in outcomes if plant is not None and verdict == "used"}
         # All but those that were used as they are, as most were.
@@ -192,7 +225,8 @@ class Service:
         withdrawn = [*self._using.replaced, *((row_set.plant, row_set.withdrawn) for row_set in finalised)]
         entries += [entry for plant, events in withdrawn for entry in self._withdrawn(plant, events)]
         entries += self._finals(finalised)
-        provisional = self._provisional([row for row in finalised if row.plant.name in used])
+        newest = [(row_set.plant, row_set.newest) for row_set in finalised if row_set.plant.name in used]
+        provisional = self._provisional(newest)
         self.fleet.forget(finalised)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
@@ -220,7 +254,7 @@ class Service:
             outputs = self.store.commit(stored, entries, malformed, self._published)
         except BaseException:
             for name in touched:
-                self.fleet.end(self.plants.pop(name))
+                self._leave(name)
             raise
         # After the commit: count versions, and let the plants with the oldest messages leave memory.
         self._published = None
@@ -228,8 +262,13 @@ class Service:
             plant.version += 1
             self.plants.move_to_end(name)
         while self.store.keeps and self.fleet.pool.used > ROWS:
-            self.fleet.end(self.plants.popitem(last=False)[1])
+            self._leave(next(iter(self.plants)))
         return outputs
+
+    def _leave(self, name: str) -> None:
+        """Let a plant leave the memory."""
+        self.fleet.end(self.plants.pop(name))
+        self._silence.forget(name)
 
     def _load(self, names: Iterable[str]) -> None:
         """Load the plants of these names from the store, if it keeps any."""
@@ -254,10 +293,10 @@ class Service:
             parts = {"node": name, "sequence": sequence, "time": self._moment(plant, time)}
             yield _refused(plant.name, parts, "future", LEAPT)
 
-    def _provisional(self, finalised: Sequence[Finalised]) -> list[Output]:
-        """Return the provisional estimates at the newest rows, and what the senders' silence means."""
-        rows = [(row_set.plant, row_set.newest) for row_set in finalised]
+    def _provisional(self, rows: Sequence[tuple[Plant, HeldRow]]) -> list[Output]:
+        """Return the provisional estimates after these rows, and what the senders' silence means."""
         outputs = []
+        self._silence.told(rows)
         for (plant, _), body in zip(rows, self._lines(b"provisional", rows), strict=True):
             if self.fleet.deciding:
                 senders = {name: status._asdict() | {"dead": status.dead}

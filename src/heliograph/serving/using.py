@@ -40,13 +40,13 @@ class Using:
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
         self.replaced: list[tuple[Plant, list[Withdrawn]]] = []  # these as they were, with their events
 
-    def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str]) -> list[Outcome]:
+    def use(self, messages: Sequence[AnyMessage | str], damaged: Container[str], wall: datetime) -> list[Outcome]:
         """Give messages to their plants, but for damaged ones, and step these; return the outcome of each message.
 
-        Afterwards the plants are as if the messages refused as implausible had never arrived.
+        `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
+        had never arrived.
         """
-        self._refused, wall = self._implausible_inputs(messages), datetime.now(UTC)
-        self._anew, self.replaced = {}, []
+        self._refused, self._anew, self.replaced = self._implausible_inputs(messages), {}, []
         outcomes = [NOTHING] * len(messages)
         # One plant after another, so that its memory is near; the messages of a plant in their order.
         by_plant: dict[str, list[int]] = {}

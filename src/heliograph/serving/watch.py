@@ -155,11 +155,12 @@ class Watch:
         self.services.append(service)
         return Watched(service, self)
 
-    def note(self, outputs: Sequence[Output], last: Taken) -> None:
-        """Record the outputs and statistics of a batch."""
-        self.took.observe(last.took)
-        self.committed.observe(last.committed)
-        self.lag.observe(last.lag)
+    def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
+        """Record the outputs and statistics of a batch; None where nothing came."""
+        if last is not None:
+            self.took.observe(last.took)
+            self.committed.observe(last.committed)
+            self.lag.observe(last.lag)
         for output in outputs:
             if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
@@ -288,7 +289,7 @@ class Watched:
         """Let the service take a batch, and record its outputs."""
         with self.watch.lock:
             outputs = self.service.take(payloads)
-            self.watch.note(outputs, self.service.last)
+            self.watch.note(outputs, self.service.last if payloads else None)
         return outputs
 
     def published(self, outputs: Sequence[Output]) -> None:

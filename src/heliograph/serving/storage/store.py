@@ -343,6 +343,11 @@ class Store:
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             return int(connection.execute(select(func.count()).select_from(PLANTS)).scalar_one())
 
+    def names(self) -> list[str]:
+        """Return the names of all stored plants."""
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            return [str(name) for name in connection.execute(select(PLANTS.c.name)).scalars()]
+
     def close(self) -> None:
         """Close the database."""
         self._engine.dispose()

@@ -75,6 +75,9 @@ class StoreProtocol(Protocol):
     def count(self) -> int:
         """Return the number of stored plants."""
 
+    def names(self) -> list[str]:
+        """Return the names of all stored plants."""
+
     def close(self) -> None:
         """Release the resources of the store."""
 
@@ -118,6 +121,10 @@ class InMemoryStore:
     def count(self) -> int:
         """Return 0: no plants are stored."""
         return 0
+
+    def names(self) -> list[str]:
+        """Return no names: no plants are stored."""
+        return []
 
     def close(self) -> None:
         """Do nothing: the store holds no resources."""

@@ -1,0 +1,95 @@
+"""Silence of senders that decide when to send: it follows from the last commit and the clock, and is not committed."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, timedelta
+from math import inf
+from time import monotonic
+
+import numpy as np
+
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant import Plant
+from heliograph.live.rows import HeldRow
+
+MOVED = 0.1  # deviations by which a mean, and share by which a deviation has to move to be told
+GRACE = 10.0  # seconds after a start in which messages that waited come first
+
+
+class Silence:
+    """What silence makes of plants whose steps have dates, and which of it is worth telling.
+
+    Of a silent plant an estimate is told where a mean has moved by a tenth of its deviation since it was told last, a
+    deviation by a tenth of itself, or a sender is dead now, or is not any more; and every so many seconds if asked for.
+
+    Args:
+        fleet: the plants of the network.
+        every: seconds after which an estimate is told although it has hardly changed; None for never.
+    """
+
+    def __init__(self, fleet: Fleet, every: float | None):
+        self.fleet, self.every, self._begun = fleet, every, monotonic()
+        self._told: dict[str, tuple[np.ndarray, tuple[str, ...], float]] = {}  # outputs, dead senders, step
+        self._resumed = set[str]()
+        n, places = len(fleet.network.states), fleet.lanes.places
+        self._means = np.array([[place.mean + i for i in range(n)] for place in places], dtype=int)
+        self._variances = np.array([[place.covariance + i * (n + 1) for i in range(n)] for place in places], dtype=int)
+
+    def resume(self, names: Iterable[str]) -> None:
+        """Note plants that a service goes on with, of which messages may wait somewhere."""
+        self._resumed.update(names)
+
+    def due(self, plants: Iterable[Plant], now: datetime) -> list[tuple[Plant, float]]:
+        """Return the plants of which another step has begun by now, with its number."""
+        step, due = self.fleet.options.step, list[tuple[Plant, float]]()
+        if step is None or not self.fleet.deciding:
+            return due
+        if self._resumed and monotonic() > self._begun + GRACE:
+            self._resumed.clear()
+        for plant in plants:
+            if plant.origin is not None and plant.name not in self._resumed:
+                passed = min((now - plant.origin) // timedelta(seconds=step), self.fleet.end_step)
+                leaps = plant.leap is not None and plant.leap.now > -inf  # which the clock confirms or contradicts
+                if passed > plant.confirmed and (leaps or passed > plant.rows.held[-1].key[0]):
+                    due.append((plant, float(passed)))
+        return due
+
+    def told(self, rows: Sequence[tuple[Plant, HeldRow]]) -> None:
+        """Note that the estimates after these rows were told."""
+        if self.fleet.options.step is not None and self.fleet.deciding:
+            outputs = self.fleet.outputs([row.slot for _, row in rows])
+            for (plant, row), output in zip(rows, outputs, strict=True):
+                self._told[plant.name] = output, self._dead(plant), row.key[0]
+                self._resumed.discard(plant.name)
+
+    def forget(self, name: str) -> None:
+        """Forget a plant that leaves the memory."""
+        self._told.pop(name, None)
+
+    def worth_telling(self, rows: Sequence[tuple[Plant, HeldRow]]) -> list[tuple[Plant, HeldRow]]:
+        """Return the rows whose estimates differ from what was told, or which are due again."""
+        outputs = self.fleet.outputs([row.slot for _, row in rows])
+        return [pair for pair, output in zip(rows, outputs, strict=True) if self._differs(*pair, output)]
+
+    def _differs(self, plant: Plant, row: HeldRow, output: np.ndarray) -> bool:
+        told = self._told.get(plant.name)
+        if told is None or told[1] != self._dead(plant):
+            return True
+        step = self.fleet.options.step or 1.0
+        if self.every is not None and (row.key[0] - told[2]) * step >= self.every:
+            return True
+        before = np.sqrt(np.maximum(told[0][self._variances], 0.0))
+        now = np.sqrt(np.maximum(output[self._variances], 0.0))
+        moved = np.abs(output[self._means] - told[0][self._means]) > MOVED * before
+        return bool((moved | (np.abs(now - before) > MOVED * before)).any())
+
+    def _dead(self, plant: Plant) -> tuple[str, ...]:
+        return tuple(name for name, status in self.fleet.senders(plant).items() if status.dead)
+
+
+def dead_by_plant(fleet: Fleet, plants: Mapping[str, Plant]) -> dict[str, list[str]]:
+    """Return the dead senders of each plant that has one."""
+    dead = {
+        name: [node for node, status in fleet.senders(plant).items() if status.dead]
+        for name, plant in (plants.items() if fleet.deciding else ())
+    }
+    return {name: nodes for name, nodes in dead.items() if nodes}
