@@ -247,8 +247,12 @@ def test_masked_numbers_did_not_arrive():
     np.testing.assert_array_equal(h.run(network(), *table).estimates["a"]["aware"].mean, expected)
 
 
-def test_a_covariance_that_is_lost_is_flagged_and_stays():
+def test_a_covariance_that_is_lost_is_flagged():
+    """Simulated, it stays as it is; of a recording the step with a negative variance is not taken, and that is said."""
     net = h.Network(plant(), {"a": h.Node(sensor(), h.perfect(), {"losing": Losing()})})
-    record = h.run(net, {"a": np.zeros(4)})
+    record = h.simulate(net, 4, 0)
     assert record.failures() == ["a/losing: no valid covariance from step 2 in 1 of 1 runs"]
     np.testing.assert_array_equal(np.asarray(record.estimates["a"]["losing"].covariance)[:, 1, 1], [1, 1, -1, -1])
+    with pytest.warns(UserWarning, match=r"node 'a': 2 rows \(3, 4\) are implausible, .* its covariance is none"):
+        record = h.run(net, {"a": np.zeros(4)})
+    np.testing.assert_array_equal(np.asarray(record.estimates["a"]["losing"].covariance)[:, 1, 1], [1, 1, 1, 1])

@@ -108,8 +108,9 @@ def test_without_a_covariance_only_what_is_no_number_is_refused():
 def test_a_prediction_over_an_absurd_time_is_no_number():
     plant = hg.Plant(lambda x, u: x * jax.numpy.exp(u), lambda u: 0.1 * u.reshape(1, 1), [1.0], 1.0, inputs=["dt"])
     stream = hg.Stream(hg.extended_filter(plant, SENSOR, hg.perfect()))
-    with pytest.raises(ValueError, match=r"inputs of step 0: expected plausible ones, got \[1e\+300\]"):
-        stream.push([1.0], [1e300])
+    said = r"inputs of step 0: expected plausible ones, got \[1000000000.0\].*transition\(x, u\) returned \[inf\]"
+    with pytest.raises(ValueError, match=said):
+        stream.push([1.0], [1e9])
     assert np.isfinite(stream.push([1.0], [1.0]).mean).all()
 
 

@@ -78,10 +78,14 @@ def test_a_live_estimate_whose_covariance_is_lost_claims_nothing():
 
 
 @pytest.mark.parametrize("z", [[0.1], [np.nan]])
-def test_a_live_estimate_whose_variance_is_negative_claims_nothing(z):
-    """Whether anything arrived or not: the covariance is lost in the prediction, which no message is refused for."""
+def test_a_live_prediction_whose_variance_is_negative_is_refused(z):
+    """Whether anything arrived or not: its covariance would be lost, and the state before it stays."""
     stream = hg.Stream(Losing())
-    assert [stream.push(z).claim for _ in range(4)] == ["nominal", "nominal", "none", "none"]
+    assert [stream.push(z).claim for _ in range(2)] == ["nominal", "nominal"]
+    for _ in range(2):
+        with pytest.raises(ValueError, match="the prediction to its time is no finite number, its covariance is none"):
+            stream.push(z)
+    assert stream.steps == 2
 
 
 class LosingByData(Losing):

@@ -154,8 +154,11 @@ def test_a_lost_covariance_is_reported_with_its_step():
     )
     with pytest.warns(UserWarning, match="the prediction to its time is no finite number"):
         assert not hg.run(network, {"n": np.full((12, 1), np.nan)}).failures()  # refused before it is lost
-    record = hg.monte_carlo(network, 12, 1, 0)
+    with pytest.warns(UserWarning) as said:
+        record = hg.monte_carlo(network, 12, 1, 0)
     (line,) = record.failures()
+    world = "the true state, which the plant makes: no finite number from step 5 in 1 of 1 runs"
+    assert str(said[0].message) == world and str(said[-1].message) == line
     assert line.startswith("n/f: no valid covariance from step ")
     step = int(line.split("step ")[1].split()[0])
     assert 0 < step < 12 and np.all(np.isfinite(record.estimates["n"]["f"].mean[0, : step - 1]))

@@ -99,7 +99,7 @@ def run(
     if messages is not None:
         lines += messages.notes
         doubts += [messages.broken] if messages.broken else []
-    _print_lines([*record.failures(), *doubts], [*_written(record, out, report), *lines])
+    _print_lines(list(dict.fromkeys([*record.failures(), *doubts])), [*_written(record, out, report), *lines])
 
 
 def _print_lines(warnings: list[str], summary: list[str]) -> None:

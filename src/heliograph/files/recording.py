@@ -10,6 +10,7 @@ import numpy as np
 
 from heliograph.files.table import TIME, columns_of, write_table
 from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
@@ -131,6 +132,8 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     for i, name in enumerate(inputs):
         fill = name == TIME_STEP and name not in columns
         u[:, i] = seconds_between(time) if fill else _complete(columns, find((name,)), source)
+        if name == TIME_STEP and (fault := time_step_fault(u[:, i])):
+            raise fail(f"{source}, row {fault.row + 1}, column {name!r}", fault.expected, fault.came)
     if not any(name in columns for name in true.values()):
         return Recording(measurements, u, time)
     unknown = np.full(len(time), np.nan)

@@ -16,6 +16,7 @@ from heliograph.filters.rows import Filtered, filtered
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import in_float64
@@ -250,7 +251,8 @@ def step_with_judgement(
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
     known = filter.estimate(state), filter.estimate(prior), estimate
-    judgement = judge(filter.claim, (state, prior, after), known, innovation, z, filter.of_atoms)
+    spoilt = inputs_spoil(filter, filter.inputs, u, k)
+    judgement = judge(filter.claim, (state, prior, after), known, innovation, z, filter.of_atoms, spoilt)
     return after, estimate, judgement, innovation
 
 
@@ -324,6 +326,8 @@ def given(filter: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     values = _numbers(f"inputs {list(filter.inputs)}" if filter.inputs else "inputs", u, len(filter.inputs))
     if isinstance(values, np.ndarray) and not np.isfinite(values).all():
         raise fail("inputs", "finite numbers", np.asarray(values).tolist())
+    if isinstance(values, np.ndarray):
+        check_time_step(filter.inputs, values)
     return values
 
 

@@ -48,7 +48,7 @@ class Reason(IntEnum):
 WORDS = {
     Reason.EXCLUDED: "a value that the model excludes",
     Reason.UNSOUND: "with it the estimate is no number, or its covariance is none",
-    Reason.PREDICTION: "the prediction to its time is no finite number",
+    Reason.PREDICTION: "the prediction to its time is no finite number, its covariance is none, or its inputs are none",
 }
 INPUT = "with it the mean loses its digits to rounding"
 
@@ -103,10 +103,11 @@ def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
 
 def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
     """Explain why inputs are implausible, by the same rule."""
-    bad = (votes[:, 3] > 0) | (votes[:, 2] == Reason.PREDICTION)
+    predicted = votes[:, 2] == Reason.PREDICTION
+    bad = (votes[:, 3] > 0) | predicted
     if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
         return None
-    return INPUT
+    return WORDS[Reason.PREDICTION] if predicted.any() else INPUT
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
@@ -125,7 +126,7 @@ def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
 
 def judge(
     claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
-    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool,
+    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool, spoilt: Array | bool = False,
 ) -> Judgement:  # fmt: skip
     """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
@@ -133,7 +134,7 @@ def judge(
     smaller one takes the mean to where it has more digits, so that an estimate which is far off can return. It is
     excluded where all of it is determined and differs from the model, or where no atom of a mixture produces it. A
     state is unsound where the one before it was not: a mean or variance that is no finite number, a negative variance,
-    an infinite number in it.
+    an infinite number in it. So is a prediction; `spoilt` says that its inputs already were none.
     """
     (before, prior, after), value = estimates, jnp.asarray(innovation.value)
     z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
@@ -158,9 +159,11 @@ def judge(
     # States that stop being numbers, by the correction or already by the prediction.
     sound = _sound(after, claim, prior)
     unsound = (_sound(prior, claim, before) & ~sound) | _overflows(states[1], states[2])
-    predicted = (_finite(before, claim) & ~_finite(prior, claim)) | _overflows(states[0], states[1])
+    predicted = (_finite(before, claim) & ~_is_prediction(prior, claim)) | _overflows(states[0], states[1])
+    predicted |= spoilt
     reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
-    reason = jnp.where(unsound & (count > 0) & ~far, Reason.UNSOUND, reason)
+    came = (count > 0) | _some(~jnp.isnan(z))  # also where what was expected is no number
+    reason = jnp.where(unsound & came & ~far, Reason.UNSOUND, reason)
     reason = jnp.where(predicted, Reason.PREDICTION, reason)
     # Inputs that move the mean to where its deviation is below its rounding.
     digits = _some(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
@@ -205,6 +208,15 @@ def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
     left, whole = diagonal_of(jnp.asarray(estimates.covariance)), diagonal_of(jnp.asarray(before.covariance))
     rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
     return _finite(estimates, claim) & ~_some(left < -rounded)
+
+
+def _is_prediction(prior: Estimate, claim: Claim) -> jax.Array:
+    """Test for finite numbers and no negative variance, to the rounding of the largest: any may have moved into it."""
+    if claim == "none":
+        return _finite(prior, claim)
+    variances = diagonal_of(jnp.asarray(prior.covariance))
+    largest = jnp.max(jnp.abs(variances), initial=0.0)
+    return _finite(prior, claim) & ~_some(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:

@@ -1,5 +1,6 @@
 """Rows of data through a filter: one scan, and the estimates and innovations that come of it."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,6 +11,7 @@ import numpy as np
 
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.inputs import check_inputs
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
@@ -98,6 +100,10 @@ def over_rows(
 def filtered(filter: Steps, z: ArrayLike, u: ArrayLike | None) -> Filtered:
     """Run a filter over rows of data, by native code where it supports the filter."""
     mean, covariance, innovation = computed(_results, _by_xla, (filter, *data_of(filter, z, u)))
+    lost = ~np.isfinite(mean).all(axis=1)
+    if lost.any():
+        said = f"{type(filter).__name__}: the estimate is no finite number from row {int(np.argmax(lost)) + 1} on"
+        warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=3)
     return Filtered(
         mean, covariance, innovation.value, innovation.covariance, innovation.log_likelihood, filter.claim,
         innovation.weight,
@@ -123,6 +129,7 @@ def data_of(
     z = z if filter.received else z[:, :0]
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
     u = rows("inputs", given, len(z), len(filter.inputs), missing=False)
+    check_inputs(filter.inputs, u, filter)
     if filter.horizon is not None and len(z) > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", len(z))
     return z, u

@@ -9,13 +9,15 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
 from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.plausibility import INPUT, in_words, why_inputs
+from heliograph.filters.plausibility import in_words, why_inputs
 from heliograph.live.program_text import text_of
 from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate, with_sound_claim
+from heliograph.model.faults import function_fault
+from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
@@ -92,18 +94,25 @@ class Stream:
         measured(self.filter, z)
         given(self.filter, u)
         stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
-        if len(u) and why_inputs(stepper.judgement[None]):
+        if len(u) and (why := why_inputs(stepper.judgement[None])):
+            check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
             state = stepper.state
             stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
             without = why_inputs(stepper.judgement[None])
             stepper.put(state)
             if not without:
-                raise fail(f"inputs of step {self.steps}", "plausible ones", f"{u.tolist()}: {INPUT}")
+                raise fail(f"inputs of step {self.steps}", "plausible ones", f"{u.tolist()}: {why}{self._fault(u)}")
         if reason > 0:
-            why = in_words(reason, distance)
+            why = in_words(reason, distance) + self._fault(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, if inputs were tried without
         stepper.accept()
+
+    def _fault(self, u: np.ndarray) -> str:
+        """Name the function of the filter's model that returned no number, after a semicolon; "" where none did."""
+        before = self.filter.estimate(self._placed.state.unflatten(self._stepper.state))
+        fault = function_fault(self.filter, before, u, self.steps)
+        return f"; {fault}" if fault else ""
 
     def sender(self) -> SenderStatus:
         """Return the status of a sender that decides when to send: what its silence means by now.
@@ -171,6 +180,7 @@ class _Placed:
         with jax.enable_x64(True):
             self.numbers, self._static = cast(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
+        self.state: PyTree = jax.tree.structure(self._start)
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
         self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter.claim))
 

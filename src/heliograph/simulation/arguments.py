@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.inputs import check_inputs
 from heliograph.numerics.check import array, check_seed, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.draws import seed_key
@@ -24,7 +25,9 @@ def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.nd
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
-    return np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
+    u: np.ndarray = np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
+    check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
+    return u
 
 
 def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:

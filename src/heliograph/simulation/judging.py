@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
+from heliograph.model.faults import function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
@@ -114,11 +116,20 @@ def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, d
     return refused
 
 
-def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
+def doubts(
+    network: Network,
+    outputs: Mapping[str, PyTree],
+    refused: Mapping[str, Mapping[int, str]],
+    u: Float[np.ndarray, "steps inputs"],
+) -> list[str]:
     """Messages about a recording: rows that are implausible, or to one filter alone, and inputs."""
     # Rows that are implausible for all filters of a node.
-    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, by_row in refused.items()
-             for rows, why in [(list(by_row), next(iter(by_row.values())))]]  # fmt: skip
+    faults = _Faults(network, outputs, u)
+    lines = []
+    for node, by_row in refused.items():
+        row, why = next(iter(by_row.items()))
+        fault = next((said for name in network.nodes[node].filters if (said := faults.of(node, name, row))), "")
+        lines.append(f"node {node!r}: {_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
     # Rows that a single filter skips.
     items = {(node, name): [field[:, f, i] for field in outputs["judged"][kind]]
             for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
@@ -128,7 +139,7 @@ def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str
         known = all_rows if node == FUSED else refused.get(node, {})
         rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in known]
         if rows:
-            why = in_words(reason[rows[0]], distance[rows[0]])
+            why = in_words(reason[rows[0]], distance[rows[0]]) + faults.of(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
@@ -136,6 +147,30 @@ def doubts(network: Network, outputs: Mapping[str, PyTree], refused: Mapping[str
         rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
         lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
+
+
+class _Faults:
+    """Functions of the filters' models that returned no number in a recording."""
+
+    def __init__(self, network: Network, outputs: Mapping[str, PyTree], u: Float[np.ndarray, "steps inputs"]):
+        self.network, self.u = network, u
+        self.outputs = outputs.get("filtered", outputs)  # beside smoothed ones
+
+    def of(self, node: str, name: str, row: int) -> str:
+        """Name the function of a filter that returned no number in a row, after a semicolon; "" where none did."""
+        central = node == FUSED
+        filter = self.network.fused[name] if central else self.network.nodes[node].filters[name]
+        if not isinstance(filter, AbstractFilter):
+            return ""
+        if row == 0:
+            before = filter.estimate(filter.init())
+        elif central:
+            before = jax.tree.map(lambda leaf: leaf[row - 1], self.outputs["fused"][name])
+        else:
+            kind, f, i = self.network.places()[node, name]
+            before = jax.tree.map(lambda leaf: leaf[row - 1, f, i], self.outputs["estimates"][kind])
+        fault = function_fault(filter, before, self.u[row], row)
+        return f"; {fault}" if fault else ""
 
 
 def _flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:

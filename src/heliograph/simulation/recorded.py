@@ -19,7 +19,7 @@ from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.smoothed import Smoother, record_of, smoothed_part, with_truth
 from heliograph.simulation.stepping import AllFilters, begun
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -96,6 +96,7 @@ def run(
     record = record_of(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
+    warn_of_no_numbers(record)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 
@@ -145,12 +146,12 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
     # Usually nothing is implausible.
     outputs = _filtered(*rest, grouped(), False)
     if not any_implausible(outputs):
-        said = doubts(network, outputs, {})
+        said = doubts(network, outputs, {}, rest[2])
     else:
         # Find all rows that are, then filter again without them.
         outputs = _filtered(*rest, grouped(), True)
         refused = refused_rows(network, outputs)
-        said = doubts(network, outputs, refused)
+        said = doubts(network, outputs, refused, rest[2])
         for name, rows in refused.items():
             z[name] = z[name].copy()
             z[name][list(rows)] = np.nan

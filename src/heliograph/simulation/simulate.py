@@ -20,7 +20,7 @@ from heliograph.simulation.centres.mesh import meshes_of
 from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.by_run import each_run, trajectories
@@ -101,7 +101,7 @@ def monte_carlo(
     if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
         by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
         if by_native_code is not None:
-            return by_native_code
+            return _warned(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
@@ -110,7 +110,15 @@ def monte_carlo(
     if single:
         network = network.in_single_precision()
         smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
-    return finished(reducer, recorded, network, smoothing)
+    return _warned(finished(reducer, recorded, network, smoothing), network)
+
+
+def _warned(result: Result, network: Network) -> Result:
+    """Return a result, with a warning where a record holds what is no number."""
+    if isinstance(result, Record):
+        complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
+        warn_of_no_numbers(result, complete, stacklevel=4)
+    return result
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:

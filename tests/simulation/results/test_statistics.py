@@ -102,7 +102,8 @@ def test_runs_that_fail_are_counted_and_no_figure_hides_them():
     network = hg.Network(
         plant, {"node": hg.Node(sensor, hg.perfect(), {"b": Breaking(), "open": hg.filters.open_loop_filter(plant)})}
     )
-    record = hg.monte_carlo(network, 6, 100, 0)
+    with pytest.warns(UserWarning, match="node/b: no valid covariance from step 0 in"):
+        record = hg.monte_carlo(network, 6, 100, 0)
     outcome = hg.monte_carlo(network, 6, 100, 0, keep=hg.Statistics())
     above = (record.measurements["node"][..., 0] > 2).any(axis=1).sum()
     assert 0 < above < 100

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.filters.rows import rows
+from heliograph.model.inputs import check_inputs
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
@@ -103,6 +104,7 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         if known is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
         u = np.zeros((steps, 0)) if known is None else rows("inputs", known, steps, count, missing=False)
+        check_inputs(network.inputs, np.asarray(u), (network.plant, network.nodes, network.fused))
         results.append((np.concatenate(columns, axis=1), np.asarray(u)))
     return results
 

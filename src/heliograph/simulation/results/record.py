@@ -1,6 +1,7 @@
 """Record of runs: trajectories of the truth, the measurements, and the estimates with their claims."""
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -338,14 +339,8 @@ class Record(Saved):
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
-                # First step and number of runs without a valid estimate.
-                bad = ~is_sound(estimate)
-                if np.any(bad):
-                    by_time = bad.reshape(-1, bad.shape[-1])
-                    step = int(np.argmax(by_time.any(axis=0)))
-                    runs = int(by_time.any(axis=1).sum())
-                    what = "mean" if estimate.claim == "none" else "covariance"
-                    lines.append(f"{node}/{name}: no valid {what} from step {step} in {runs} of {len(by_time)} runs")
+                what = "mean" if estimate.claim == "none" else "covariance"
+                lines += [f"{node}/{name}: no valid {what} {when}" for when in _when(~is_sound(estimate))]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
@@ -354,6 +349,41 @@ class Record(Saved):
                     counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
                     lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
         return lines
+
+
+def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel: int = 3) -> None:
+    """Warn of estimates, and of what was simulated, that are no finite numbers from some step on, a line each.
+
+    Covariances are not judged here, which of many runs takes long; `Record.failures` does.
+
+    Args:
+        record: the record.
+        complete: names of simulated nodes at which nothing is ever lost, so that a NaN is the sensor's.
+        stacklevel: as of `warnings.warn`, of the caller.
+    """
+    simulated = {} if record.truth is None else {"the true state, which the plant makes": record.truth}
+    for name in complete:
+        simulated[f"measurements of node {name!r}, where nothing is lost"] = record.measurements[name]
+    for what, values in simulated.items():
+        for when in _when(~np.isfinite(values).all(axis=-1)):
+            warnings.warn(f"{what}: no finite number {when}", stacklevel=stacklevel + 1)
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            bad = ~np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+            if estimate.claim != "none" and node != FUSED:  # there a quantizer may say that it knows no bound
+                bad |= ~np.isfinite(np.asarray(estimate.covariance)).all(axis=(-1, -2))
+            what = "mean" if estimate.claim == "none" else "covariance"
+            for when in _when(bad):
+                warnings.warn(f"{node}/{name}: no valid {what} {when}", stacklevel=stacklevel + 1)
+
+
+def _when(bad: np.ndarray) -> list[str]:
+    """Say from which step on, and in how many runs, something (..., time) is bad; nothing where it never is."""
+    if not np.any(bad):
+        return []
+    by_time = bad.reshape(-1, bad.shape[-1])
+    step, runs = int(np.argmax(by_time.any(axis=0))), int(by_time.any(axis=1).sum())
+    return [f"from step {step} in {runs} of {len(by_time)} runs"]
 
 
 def _per_node(nodes: Sequence[str], values: Mapping[str, int]) -> np.ndarray:

@@ -1,0 +1,206 @@
+"""Inputs of a plant: a time step that does not go backwards, and what the plant's functions return for them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
+from heliograph.numerics.linalg import rounding
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.noise import AbstractNoise
+
+LONGEST = 2.0**53  # units of a time step; a double counts no time beyond it
+WRAPPED = 2.0**32  # a difference of unsigned counters of 32 bits that is -d reads 2^32 - d
+NEAR = 2.0**24  # how far below 2^32 a whole number is taken for such a difference
+ROWS = 4096  # of inputs for which functions are computed at once
+MOST_SHOWN = 100  # characters of a matrix
+LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more than they do
+
+MatrixOfInputs = Callable[[AbstractPlant, jax.Array], jax.Array]
+
+
+class Fault(NamedTuple):
+    """A row whose time step is none: its number from 0, what was expected, and what came."""
+
+    row: int
+    expected: str
+    came: str
+
+
+def time_step_fault(dt: Float[np.ndarray, " steps"]) -> Fault | None:
+    """Return the first time step that is none: one that goes backwards, a counter that wrapped, one beyond 2^53."""
+    bad = ~np.asarray(_is_time_step(dt))
+    if not bad.any():
+        return None
+    row = int(np.argmax(bad))
+    came = f"{dt[row]:.10g}"
+    if dt[row] < 0:
+        return Fault(row, "a time step that does not go backwards", came)
+    if dt[row] > LONGEST:
+        return Fault(row, "a time step of at most 2^53 units, as far as a double counts", came)
+    return Fault(
+        row, "a time step", f"{came}: {dt[row] - WRAPPED:.10g} as a difference of unsigned counters of 32 bits"
+    )
+
+
+def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
+    """Raise ValueError unless each time step, the input "dt", is a number from 0 to 2^53 and no counter that wrapped.
+
+    Args:
+        names: names of the inputs.
+        u: one row of inputs (inputs,), or rows (steps, inputs).
+    """
+    if TIME_STEP not in names or isinstance(u, jax.core.Tracer):
+        return
+    fault = time_step_fault(np.atleast_2d(np.asarray(u))[:, list(names).index(TIME_STEP)])
+    if fault is not None:
+        where = f"input {TIME_STEP!r}" + (f", row {fault.row + 1}" if np.ndim(u) > 1 else "")
+        raise fail(where, fault.expected, fault.came)
+
+
+def _is_time_step(dt: Array) -> Array:
+    wrapped = (dt >= WRAPPED - NEAR) & (dt < WRAPPED) & (dt % 1 == 0)
+    return (dt >= 0) & (dt <= LONGEST) & ~wrapped
+
+
+def check_inputs(names: Sequence[str], u: Float[Array, "steps inputs"], models: PyTree, step: int = 0) -> None:
+    """Raise ValueError where a time step is none, or a plant's function of the inputs returns what it must not.
+
+    Args:
+        names: names of the inputs.
+        u: the inputs of consecutive steps (steps, inputs).
+        models: a filter, nodes or anything else that holds plants with these inputs.
+        step: number of the first of the steps.
+    """
+    if isinstance(u, jax.core.Tracer) or not len(names):
+        return
+    u = np.asarray(u)
+    check_time_step(names, u)
+    known: set[int] = set()
+    for plant in plants_in(models):
+        if id(plant) not in known and first(plant).inputs == tuple(names):
+            _check_functions(plant, u, step)
+        known.add(id(plant))
+
+
+def plants_in(models: PyTree) -> Iterator[AnyPlant]:
+    """Yield the plants that a model object holds."""
+    yield from parts_in(models, AbstractPlant)
+
+
+def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
+    """Yield what a model object holds of a class of models, constant or over time."""
+
+    def is_part(part: object) -> bool:
+        return isinstance(part.values if isinstance(part, OverTime) else part, kind)
+
+    yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
+
+
+def _functions(plant: AbstractPlant) -> dict[str, MatrixOfInputs]:
+    """Functions of the inputs alone, by name: matrices, and the covariance of the noise."""
+    every: dict[str, MatrixOfInputs] = {}
+    if isinstance(plant, LinearPlant):
+        if isinstance(plant.matrix, OfInputs):
+            every["plant matrix(u)"] = LinearPlant.transition_matrix
+        if isinstance(plant.input_matrix, OfInputs):
+            every["input matrix(u)"] = _input_matrix
+    if not isinstance(plant.noise, AbstractNoise):
+        every[NOISE] = AbstractPlant.noise_covariance
+    return every
+
+
+NOISE = "process noise covariance(u)"
+
+
+def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
+    assert isinstance(plant, LinearPlant)
+    return matrix_of(plant.input_matrix, u)
+
+
+def _check_functions(plant: AnyPlant, u: Float[np.ndarray, "steps inputs"], step: int) -> None:
+    for name, function in _functions(first(plant)).items():
+        values = np.concatenate(list(_in_parts(plant, function, u, step)))
+        wrong = covariances_wrong(values) if name == NOISE else ~np.isfinite(values).all(axis=(1, 2))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
+            where = f"row {row + 1}" if len(u) > 1 else f"step {step}"
+            came = f"{_shortened(values[row])} in {where}, for {given}"
+            raise fail(name, "a covariance" if name == NOISE else "finite numbers", came)
+
+
+def _in_parts(
+    plant: AnyPlant, function: MatrixOfInputs, u: Float[np.ndarray, "steps inputs"], step: int
+) -> Iterator[Float[np.ndarray, "steps n m"]]:
+    """Yield what a function returns, some steps at a time."""
+    for start in range(0, len(u), ROWS):
+        part = u[start : start + ROWS]
+        with jax.enable_x64(True):
+            yield np.asarray(
+                jax.vmap(lambda k, u_k: function(at(plant, k), u_k))(step + start + np.arange(len(part)), part)
+            )
+
+
+def _shortened(value: np.ndarray) -> str:
+    shown = str(np.round(value, 12).tolist())
+    return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
+
+
+def covariances_wrong(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
+    """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
+    finite = np.isfinite(values).all(axis=(1, 2))
+    safe = np.where(finite[:, None, None], values, 0.0)
+    unit = standard_deviations(safe)
+    correlations = safe / (unit[:, :, None] * unit[:, None, :])
+    skew = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0.0)
+    smallest = np.linalg.eigvalsh((correlations + np.swapaxes(correlations, 1, 2)) / 2)[:, 0]
+    wrong: np.ndarray = ~finite | (skew > SYMMETRY_TOLERANCE) | (smallest < -DEFINITENESS_TOLERANCE)
+    return wrong
+
+
+def inputs_spoil(model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int) -> jax.Array:
+    """Test in a compiled step whether the time step is none or a plant's function of the inputs returns what is none.
+
+    Args:
+        model: a filter, or anything else that holds plants with these inputs.
+        names: names of the inputs.
+        u: inputs of the step (inputs,).
+        k: number of the step.
+    """
+    spoilt = jnp.asarray(False)
+    if TIME_STEP in names:
+        spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)]))
+    for varying in plants_in(model):
+        plant = at(varying, k)
+        if not names or plant.inputs != tuple(names):
+            continue
+        for name, function in _functions(plant).items():
+            value = function(plant, u)
+            spoilt |= ~(_is_covariance(value) if name == NOISE else jnp.all(jnp.isfinite(value)))
+    return spoilt
+
+
+def _is_covariance(matrix: jax.Array) -> jax.Array:
+    """Test a matrix (n, n) by elimination of its correlations: finite, symmetric, no pivot below zero.
+
+    Where a pivot is zero, nothing may be left of its column: |c_ij|^2 <= c_ii c_jj.
+    """
+    variances = jnp.diagonal(matrix)
+    scale = 1 / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    left = matrix * scale[:, None] * scale
+    sound = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
+    sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, left))
+    tolerance = rounding(LOOSE * DEFINITENESS_TOLERANCE, left, 10 * len(matrix))
+    for _ in range(len(matrix)):
+        pivot, column = left[0, 0], left[1:, 0]
+        determined = pivot <= tolerance
+        sound &= (pivot >= -tolerance) & (~determined | jnp.all(column**2 <= 2 * tolerance))
+        taken = column / jnp.where(determined, 1.0, pivot)
+        left = left[1:, 1:] - jnp.where(determined, 0.0, taken[:, None] * left[0, 1:])
+    return sound
