@@ -1,5 +1,6 @@
 """Arrivals of one received number over a recording: when it was due, how often it came, how often it was lost."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from heliograph.filters.innovation import independent_count
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Bool, Float
 
 FEW = 8  # arrivals from which a rate of its own can be told
 NEAR = 0.25  # of a period: how far an interval may be from whole periods
@@ -23,12 +24,13 @@ class Arrivals:
     Args:
         node: name of the node.
         component: name of the component.
-        time: times of the rows (time,), numbers or dates.
-        arrived: whether it arrived in each row (time,).
+        time: times of the rows (time,), numbers or dates, each once.
+        arrived: whether it arrived at each of them (time,).
         values: those that arrived.
         may_be_lost: whether the network says that it may be lost, or is not always sent.
         declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
         stated_share: probability of arrival by the network; None where it is not one number, as in bursts.
+        of_messages: whether each row is there because some node's message is, so that others are not due in it.
     """
 
     node: str
@@ -39,6 +41,7 @@ class Arrivals:
     may_be_lost: bool
     declared_period: int | None = None
     stated_share: float | None = None
+    of_messages: bool = False
 
     @cached_property
     def period(self) -> float | None:
@@ -55,16 +58,19 @@ class Arrivals:
         if len(intervals) < FEW - 1 or self.arrived.all():
             return None
         period = float(np.median(intervals))
-        if period < SLOWER * spacing or period <= 0:
+        if not self.of_messages and period < SLOWER * spacing:
             return None
         apart = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
         return period if np.mean(apart <= NEAR) >= REGULAR else None
 
     @property
-    def due(self) -> int:
-        """Number of messages that were due: one a row, or one a period from the first arrival to the last row."""
+    def due(self) -> int | None:
+        """Number of messages that were due: one a row, or one a period from the first arrival to the last row.
+
+        None where rows are messages of other nodes and this one has no period: then nobody knows.
+        """
         if self.period is None:
-            return len(self.arrived)
+            return None if self.of_messages and not self.arrived.all() else len(self.arrived)
         clock = _clock(self.time)
         came = clock[self.arrived]
         if not len(came):
@@ -75,8 +81,8 @@ class Arrivals:
 
     @property
     def share(self) -> float:
-        """Share of the messages that were due which arrived."""
-        return min(float(self.arrived.sum()) / self.due, 1.0)
+        """Share of the messages that were due which arrived; NaN where nobody knows how many were."""
+        return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
 
     def contradicts(self, level: float) -> bool:
         """Test at a level whether the share that arrived is another than the stated one, and by more than a hundredth.
@@ -84,15 +90,17 @@ class Arrivals:
         Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a).
         """
         p = self.stated_share
-        if p is None or not 0 < p < 1:
+        if p is None or self.due is None or not 0 < p < 1:
             return False
         independent = self.due if self.period is not None else independent_count(self.arrived.astype(float))
         deviation = np.sqrt(p * (1 - p) / independent)
         return bool(abs(self.share - p) > max(-ndtri(level / 2) * deviation, LEAST_SHARE))
 
     @property
-    def longest_gap(self) -> int:
-        """Greatest number of messages in a row that were due and did not arrive."""
+    def longest_gap(self) -> int | None:
+        """Greatest number of messages in a row that were due and did not arrive; None where nobody knows."""
+        if self.due is None:
+            return None
         if self.period is None:
             ends = np.flatnonzero(np.concatenate([[True], self.arrived, [True]]))
             return int(np.max(np.diff(ends)) - 1)
@@ -105,6 +113,16 @@ class Arrivals:
         """Return the number of messages that were due since the last arrival, and are late by more than is usual."""
         assert self.period is not None  # only then is it asked
         return max(int((clock[-1] - came[-1]) / self.period - NEAR), 0)
+
+
+def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
+    """Test whether rows are there because messages are: something arrived at each time, mostly of one node alone.
+
+    Args:
+        arrived: by node, whether anything of it arrived at each time.
+    """
+    together = np.sum(list(arrived.values()), axis=0)
+    return len(arrived) > 1 and bool(np.all(together > 0) and np.median(together) <= 1)
 
 
 def _clock(time: np.ndarray) -> Float[np.ndarray, " time"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
@@ -11,7 +12,7 @@ from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 from heliograph.random_affine.erasure import outcomes
-from heliograph.report.arrivals import Arrivals
+from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -160,19 +161,6 @@ def examine(
     network: Network, record: Record, inputs: np.ndarray, advance: Callable[[str], object] = lambda what: None
 ) -> Health:
     """Diagnose links and filters of a recording that was run through the network."""
-    received = record.measurements
-    # Links: when each component arrived.
-    links = []
-    for node in received:
-        z, receiver = received[node], network.nodes[node]
-        declared, may_be_lost = None, not receiver.complete
-        if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
-            declared, may_be_lost = receiver.trigger.period, first(receiver.channel).erases
-        shares = _stated_shares(receiver)
-        for i, name in enumerate(receiver.received_names):
-            there = ~np.isnan(z[:, i])
-            stated = None if shares is None or i >= len(shares) else float(shares[i])
-            links.append(Arrivals(node, name, record.time, there, z[there, i], may_be_lost, declared, stated))
     # Filters: innovations whitened by their claimed covariance, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
     for listener in listeners(network, record):
@@ -185,7 +173,33 @@ def examine(
             test = _test_of(white)
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
-    return Health(record, links, filters, outputs, network.shared)
+    return Health(record, _links(network, record), filters, outputs, network.shared)
+
+
+def _links(network: Network, record: Record) -> list[Arrivals]:
+    """Return when each component arrived, by distinct times: of messages at one time each may be a row."""
+    time, row = np.unique(record.time, return_inverse=True)
+
+    def by_time(there: Any) -> np.ndarray:
+        came = np.zeros(len(time), dtype=bool)
+        came[row[there]] = True
+        return came
+
+    received = record.measurements
+    messages = rows_are_messages({node: by_time(np.any(~np.isnan(z), axis=1)) for node, z in received.items()})
+    links = []
+    for node, z in received.items():
+        receiver = network.nodes[node]
+        declared, may_be_lost, shares = None, not receiver.complete, _stated_shares(receiver)
+        if isinstance(receiver, Node) and isinstance(receiver.trigger, Periodic):
+            declared, may_be_lost = receiver.trigger.period, first(receiver.channel).erases
+        for i, name in enumerate(receiver.received_names):
+            there = ~np.isnan(z[:, i])
+            stated = None if shares is None or i >= len(shares) else float(shares[i])
+            links.append(
+                Arrivals(node, name, time, by_time(there), z[there, i], may_be_lost, declared, stated, messages)
+            )
+    return links
 
 
 def _test_of(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:

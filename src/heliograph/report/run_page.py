@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
+from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, GREEN, VERMILION, WIDTH, legend_above, stacked_panels
 from heliograph.report.health import Health
 from heliograph.report.innovations import (
@@ -90,11 +91,11 @@ def _links(health: Health) -> Figure:
     axes = figure.subplots()
     for row, link in enumerate(links):
         # A sender that is slower than the rows loses nothing in those between.
-        lost = health.record.time[~link.arrived] if link.period is None else health.record.time[:0]
-        came = health.record.time[link.arrived]
+        lost = link.time[~link.arrived] if link.period is None and link.due is not None else link.time[:0]
+        came = link.time[link.arrived]
         axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
         axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
-    names = [in_figure(f"{link.node}: {link.component} ({link.share:.0%})") for link in links]
+    names = [in_figure(f"{link.node}: {link.component}{_share(link, ' ({:.0%})', '')}") for link in links]
     axes.set_yticks(range(len(links)), names)
     axes.set_ylim(len(links) - 0.5, -0.5)
     axes.grid(visible=False)
@@ -105,13 +106,12 @@ def _links(health: Health) -> Figure:
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
     """Return the report; `drawings` holds each figure as SVG, of which those stay that fit into a page."""
     record, doubts, drawings = health.record, health.warnings(), within(drawings, PAGE)
-    arrived = np.mean([link.share for link in health.links]) if health.links else np.nan
+    shares = [link.share for link in health.links if link.due is not None]
+    arrived = f"{np.mean(shares):.1%}" if shares else "–"
     # Three numbers to remember.
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
-        KeyFigure(
-            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} should receive", GREEN
-        ),
+        KeyFigure("arrived", arrived, f"of what {_counted(len(record.measurements), 'node')} should receive", GREEN),
         KeyFigure("doubts", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     # The result is the title; doubts follow it.
@@ -155,8 +155,7 @@ def _finding(health: Health) -> str:
     for i in shown:
         band = f" ± {rounded(BAND * deviation[i], deviation[i])}" if estimate.claim != "none" else ""
         state, unit = record.states[i], record.units.get(record.states[i], "")
-        named = state.removesuffix(f"({unit})").strip()
-        numbers.append(f"{visible(named)} {rounded(mean[i], deviation[i])}{band} {visible(unit)}".strip())
+        numbers.append(f"{visible(state)} {rounded(mean[i], deviation[i])}{band} {visible(unit)}".strip())
     return f"{', '.join(numbers)} at the end, by {visible(name)}"
 
 
@@ -245,13 +244,15 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
         mean, deviation = _moments(link.values)
         known = "may be lost" if link.may_be_lost else "never lost"
         name = visible(f"{link.node}: {link.component}")
-        sent = "each row" if link.period is None else f"each {link.period:.4g}"
-        rows.append([name, sent, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
+        regular = "each row" if link.period is None else f"each {link.period:.4g}"
+        sent, gap = ("not known", "–") if link.due is None else (regular, str(link.longest_gap))
+        rows.append([name, sent, _share(link, "{:.1%}", "–"), gap, known, mean, deviation])
     headers = ["received", "due", "arrived", "longest gap", "the network says", "mean", "std. deviation"]
     unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
     slower = (
         f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
-        "found; a **gap** counts what was due and did not come."
+        "found. Where each row is a message of some node, nobody knows when another without such an interval is due. A "
+        "**gap** counts what was due and did not come."
     )
     came, lost = any(link.arrived.any() for link in health.links), not all(link.arrived.all() for link in health.links)
     parts = ["arrived (blue, above)"] * came + ["did not (orange, below)" if came else "did not arrive (orange)"] * lost
@@ -265,6 +266,11 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
         *missing,
         *shared_text(health.shared),
     ]
+
+
+def _share(link: Arrivals, form: str, unknown: str) -> str:
+    """Return the share that arrived in this form, or what stands for it where nobody knows how many were due."""
+    return unknown if link.due is None else form.format(link.share)
 
 
 def _moments(values: np.ndarray) -> tuple[str, str]:
@@ -311,7 +317,8 @@ def run_summary(health: Health) -> dict[str, Json]:
     # Links, by node and component.
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
-        numbers: dict[str, Json] = {"arrived": link.share, "longest_gap": link.longest_gap}
+        share = None if link.due is None else link.share
+        numbers: dict[str, Json] = {"arrived": share, "longest_gap": link.longest_gap}
         period: dict[str, Json] = {} if link.period is None else {"period": link.period}
         links.setdefault(link.node, {})[link.component] = numbers | period
     return {
