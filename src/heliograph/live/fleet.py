@@ -86,6 +86,12 @@ class Fleet:
         nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
         deciding = {name: (node.trigger, node) for name, node in nodes.items() if node.trigger is not None}
         self.deciding = {name: (trigger, LossChain.of_node(node)) for name, (trigger, node) in deciding.items()}
+        self._numbered = {
+            i: nodes[name].received - trigger.side_information(len(nodes[name].outputs))
+            for i, name in enumerate(network.names)
+            for trigger, _ in ([self.deciding[name]] if name in self.deciding else [])
+            if trigger.losses == "numbered"
+        }  # fmt: skip
         # A slot with the prior, for plants that have not begun.
         self._blank = self.pool.take()
         self.pool.start(self._blank, -1.0)
@@ -145,11 +151,40 @@ class Fleet:
         index, size = self.sizes.get(node, (0, -1))
         if size < 0:
             raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
-        if len(values) != size:
+        numbers = self.with_losses(node, [nan if value is None else value for value in values])
+        if len(numbers) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
-        numbers = [nan if value is None else value for value in values]
         return Known(index, sequence, time, numbers, arrival)
+
+    def with_losses(self, node: str, values: list[float]) -> list[float]:
+        """Return values with a place behind them for the number of lost ones, which the running count says.
+
+        Raises:
+            ValueError: values of a sender of single components, whose losses a count of messages does not say.
+        """
+        (_, size), outputs = self.sizes[node], self.values_of(node)
+        if outputs is None:
+            return values
+        values = values + [nan] * (size - outputs if len(values) == outputs else 0)
+        alone = self.deciding[node][0].region == "each" and len(values) == size
+        if alone and any(a == a and b != b for a, b in zip(values[:outputs], values[outputs:], strict=True)):
+            expected = "behind each value how many of its component were lost since the last"
+            raise fail(
+                f"message of {node!r}, values", expected, "none, and its count is of messages, not of components"
+            )
+        return values
+
+    def values_of(self, node: str) -> int | None:
+        """Return how many values an event has without the numbers of lost ones; None if it has no such numbers."""
+        return self._numbered.get(self.sizes[node][0])
+
+    def _lost_column(self, node: int) -> tuple[str, int] | None:
+        """Return the name of a node whose running count says what was lost, and the column of the number."""
+        outputs = self._numbered.get(node)
+        if outputs is None or self.size(node) != outputs + 1:
+            return None
+        return self._names[node], self._places[node].start + outputs
 
     def check_step(self, name: str, time: float) -> None:
         """Refuse a time that is no step of the network, where time counts steps."""
@@ -182,7 +217,7 @@ class Fleet:
         if verdict != "used":
             return verdict
         self.end_silence(plant)
-        plant.take(event, key, self.pool.take, self.width)
+        plant.take(event, key, self.pool.take, self.width, self._lost_column(event.node_index))
         leap = self.options.leap
         sure = clock is not None and abs(event.arrival - clock) <= leap
         plant.pass_time(event.time, now, leap, sure, self._names)

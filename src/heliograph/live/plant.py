@@ -193,17 +193,30 @@ class Plant:
                 self.dirty = index if self.dirty is None else min(self.dirty, index)
         return [Withdrawn(*name) for row in rows for name in row.events], [row.slot for row in rows]
 
-    def take(self, event: Known, key: Key, slot: Callable[[], int], width: int) -> None:
-        """Add an event to the row with its key, or to a new row in a slot of its own; record the change for `undo`."""
+    def take(
+        self, event: Known, key: Key, slot: Callable[[], int], width: int, numbered: tuple[str, int] | None
+    ) -> None:
+        """Add an event to the row with its key, or to a new row in a slot of its own; record the change for `undo`.
+
+        `numbered`: name of a node whose transmissions are counted, and the column of the number of those lost.
+        """
         index, row = self.rows.find(key)
         if row is None:
             row = HeldRow(key, slot(), width)
             self.rows.keys.insert(index, key)
             self.rows.held.insert(index, row)
-            self.changes.append((row, None))
+            change: Change = row, None
         else:
-            self.changes.append((row, (row.numbers.copy(), dict(row.events))))
+            change = row, (row.numbers.copy(), dict(row.events))
         self.rows.fill(row, event)
+        if numbered is not None and row.numbers[numbered[1]] != row.numbers[numbered[1]]:  # it does not say by itself
+            name, column = numbered
+            newest = self.links[name].newest if name in self.links else -1
+            row.numbers[column], others = self.rows.count_lost(index, event, column, newest)
+            for other, number in others:
+                self.changes.append((other, (other.numbers.copy(), dict(other.events))))
+                other.numbers[column] = number
+        self.changes.append(change)  # last: that of the event itself
         self.dirty = index if self.dirty is None else min(self.dirty, index)
 
     def undo(self) -> list[int]:

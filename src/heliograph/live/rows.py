@@ -97,6 +97,40 @@ class Rows:
         row.numbers[at] = values
         row.events[event.name] = event.values
 
+    def count_lost(
+        self, index: int, event: Known, column: int, newest: int
+    ) -> tuple[float, list[tuple[HeldRow, float]]]:
+        """Return how many of a sender's transmissions were lost before an event, by the running count; NaN if unknown.
+
+        Also the row of the sender's next event with what is the number there now, if the event stands before one.
+
+        Args:
+            index: index of the event's row.
+            event: the event.
+            column: column of the number in a row.
+            newest: greatest running count before the event, -1 if there was none.
+        """
+        before = self._event_of(event.node_index, range(index - 1, -1, -1))
+        after = self._event_of(event.node_index, range(index + 1, len(self.held)))
+        count = event.sequence
+        if before is not None:
+            newest = before[1]
+        elif after is not None:
+            lost = after[0].numbers[column]
+            newest = after[1] - int(lost) - 1 if lost == lost else -1
+        number = float(count - newest - 1) if 0 <= newest < count else nan
+        if after is None:
+            return number, []
+        return number, [(after[0], float(after[1] - count - 1) if count < after[1] else nan)]
+
+    def _event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
+        """Return the first of these rows with an event of a node, and the running count of this."""
+        for i in indices:
+            for name in self.held[i].events:
+                if name[0] == node:
+                    return self.held[i], name[1]
+        return None
+
     def finalise(self, watermark: float) -> tuple[int, int]:
         """Return the index of the new base, and how many rows become final early, for lack of room."""
         by_time = self.base(watermark)

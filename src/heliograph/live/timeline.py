@@ -274,7 +274,10 @@ class Timeline:
         at = moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", at)
         came = max(self._plant.confirmed, at) if arrival is None else moment(f"{name}, arrival", arrival)
-        return Known(index, whole(f"{name}, sequence", sequence), at, numbers(name, values, size).tolist(), came)
+        alone = self._fleet.values_of(node)
+        size = size if alone is None or np.size(values) != alone else alone
+        known = self._fleet.with_losses(node, numbers(name, values, size).tolist())
+        return Known(index, whole(f"{name}, sequence", sequence), at, known, came)
 
     def _finalise(self) -> None:
         """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
