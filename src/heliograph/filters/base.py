@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, NoReturn, ParamSpec, Protocol, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, ParamSpec, Protocol, TypedDict, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable
@@ -41,6 +42,13 @@ INSTEAD = {  # what other packages call what a filter does here
     "smooth": "hg.rts_smoother(filter, z, u)",
     "gain": "hg.steady_state(plant, sensor).gain",
 }
+
+
+class FilterAngles(NamedTuple):
+    """Places of the angles among a filter's states, and among the numbers that it receives."""
+
+    states: Angles
+    received: Angles
 
 
 @readable
@@ -169,6 +177,10 @@ class AbstractFilter(Module):
         """Return a planned filter that can be smoothed, given the smoother `steps` of the original filter over time."""
         return self
 
+    def angles_used(self) -> FilterAngles | None:
+        """Return which states and received numbers it takes for angles; None where it does not say."""
+        return None
+
     @property
     def of_atoms(self) -> bool:
         """True for a mixture over atoms, whose likelihood alone says which values its model excludes."""
@@ -192,6 +204,10 @@ class AbstractSizedFilter(AbstractFilter):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return no angles: what is given models with angles says so itself, or refuses them."""
+        return FilterAngles((), ())
 
 
 class Sizes(TypedDict):

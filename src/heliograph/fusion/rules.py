@@ -25,6 +25,7 @@ from heliograph.fusion.report_link import ReportLink, ReportLinks
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
+from heliograph.model.plant import AnyPlant, angles_among
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
 from heliograph.numerics.module import Module, readable
@@ -88,13 +89,13 @@ class AbstractFusion(Module):
         return gains_of(self.neighbour_weights(believed), step)
 
 
-def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] = ()) -> Estimate:
+def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int] | AnyPlant" = ()) -> Estimate:
     """Fuse estimates of one state; leading axes (run, time) are carried along.
 
     Args:
         rule: the fusion rule, such as `CovarianceIntersection()`.
         estimates: estimates of one state, with means (..., n) and covariances (..., n, n).
-        angles: which states are angles, by place; none by default.
+        angles: which states are angles, by place, or the plant whose they are; none by default.
 
     Raises:
         ValueError: no estimates, estimates of different state dimensions, angles that are no places in the state.
@@ -109,9 +110,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] 
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
-    which = tuple(int(i) for i in array("angles", items("angles", angles, "places"), (None,)))
-    if not set(which) <= set(range(means.shape[-1])):
-        raise fail("angles", f"places from 0 to {means.shape[-1] - 1}", list(which))
+    which = angles_among(angles, means.shape[-1])
     means = nearest(means, means[..., :1, :], which)
     # The rule, over all leading axes; the claim from those of the inputs.
     covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)

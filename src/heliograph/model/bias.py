@@ -2,16 +2,18 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs, Plant, matrix_of
+from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
-from heliograph.numerics.traced import is_traced, is_zero, library, scipy_for
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array, ArrayLike, Float, renamed
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 Biases = TypeAliasType("Biases", Float[ArrayLike, " biases"])  # or one number for all
@@ -62,7 +64,11 @@ def with_bias(
     seen = array("loading of the bias", seen, (outputs, count))
     entering = np.zeros((n, seen.shape[1])) if entering is None else entering
     if not isinstance(bias, LinearPlant):
-        named = [f"{name}_bias" for name in sensor.outputs] if alone else [f"bias{i}" for i in range(seen.shape[1])]
+        named = (
+            [renamed(name, f"{name}_bias") for name in sensor.outputs]
+            if alone
+            else [f"bias{i}" for i in range(seen.shape[1])]
+        )
         bias = _gauss_markov(plant, named, bias, time, dt)
     return driven_by(plant, bias, entering), _biased(sensor, seen, n)
 
@@ -91,80 +97,87 @@ def _gauss_markov(
     return LinearPlant(lambda u: jnp.diag(jnp.exp(-u[0] * rate)), fresh_in, center, start, states=names, inputs=[dt])
 
 
+class Driven(Module):
+    """Transition (f(x, u) + E b, F b + B u) of the plant of [x; b], x+ = f(x, u) + E b + w and b+ = F b + B u + xi.
+
+    Args:
+        plant: the plant of x.
+        bias: that of b.
+        coupling: E.
+        places: of the inputs of b among those of x.
+    """
+
+    plant: AbstractPlant
+    bias: LinearPlant
+    coupling: Array
+    places: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """The state after a step."""
+        n = len(self.plant.states)
+        moved = self.plant.transition(x[:n], u) + jnp.asarray(self.coupling) @ x[n:]
+        return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
+
+
 def driven_by(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
     """The plant of [x; b]: x and b start independently of each other, and are driven by independent noises."""
-    n, models = len(plant.states), (plant, bias)
+    models = plant, bias
     if set(bias.inputs) - set(plant.inputs):
         raise fail("bias", f"a plant whose inputs are some of {list(plant.inputs)}", list(bias.inputs))
-    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
-    states = (*plant.states, *renamed.values())
-    circular = (*plant.circular, *(renamed[name] for name in bias.circular))
-    # Both laws of the initial state, as noise laws.
+    new = {name: renamed(name, f"bias_{name}") if name in plant.states else name for name in bias.states}
+    states = (*plant.states, *new.values())
+    circular = (*plant.circular, *(new[name] for name in bias.circular))
+    # Both laws of the initial state, and of the noises.
     laws = [model.deviation or Gaussian(model.initial_covariance) for model in models]
     centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
-    center = library(*centers).concatenate(centers)
+    center, start = library(*centers).concatenate(centers), Independent(laws)
+    places = tuple(plant.inputs.index(name) for name in bias.inputs)
     noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
-    constant = len(noises) == 2 and not any(isinstance(m, OfInputs) for model in models for m in vars(model).values())
-    pick = np.eye(len(plant.inputs))[[plant.inputs.index(name) for name in bias.inputs]]  # its inputs among all
-    # [x; b]+ = [[A, E], [0, F]] [x; b] + [B; B_b] u + [w; xi].
-    if isinstance(plant, LinearPlant) and constant:
+    every = tuple(range(len(plant.inputs)))
+    noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (every, places))
+    if not isinstance(plant, LinearPlant):
+        move = Driven(plant, bias, coupling, places)
+        return Plant(move, noise, center, start, states, plant.inputs, circular)
+    matrix, driven = _blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
+    return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular)
+
+
+def _blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
+    """[[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
+    below = np.zeros((len(bias.states), len(plant.states)))
+    if not any(isinstance(value, OfInputs) for model in (plant, bias) for value in vars(model).values()):
         xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
-        matrix = xp.block([[plant.matrix, coupling], [np.zeros((len(bias.states), n)), bias.matrix]])
-        driven = xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
-        return LinearPlant(
-            matrix, Independent(noises), center, Independent(laws), driven, states, plant.inputs, circular
-        )
-    # As functions; Gaussian laws are their covariances.
-    blocks = [model.initial_covariance for model in models]
-    covariance = scipy_for(blocks).linalg.block_diag(*blocks)
-    start = covariance if all(model.deviation is None for model in models) else Independent(laws)
-    return _by_functions(plant, bias, (coupling, pick), (center, start), (states, circular))
+        matrix = xp.block([[plant.matrix, coupling], [below, bias.matrix]])
+        return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
 
+    def move(u: jax.Array) -> jax.Array:
+        own = bias.transition_matrix(pick @ u)
+        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), own]])
 
-def _by_functions(
-    plant: AbstractPlant,
-    bias: LinearPlant,
-    matrices: tuple[np.ndarray, np.ndarray],
-    start: tuple[Any, Any],
-    names: tuple[tuple[str, ...], tuple[str, ...]],
-) -> LinearPlant | Plant:
-    """The plant of [x; b] where x is not linear or something depends on inputs; a noise that does has mean zero."""
-    n, coupling, (states, circular) = len(plant.states), matrices[0], names
-    pick: Any = matrices[1]
-
-    def spread(u: jax.Array) -> jax.Array:
-        parts = plant.noise_covariance(u), bias.noise_covariance(pick @ u)
-        return jnp.asarray(jax.scipy.linalg.block_diag(*parts))
-
-    def move(x: jax.Array, u: jax.Array) -> jax.Array:
-        moved = plant.transition(x[:n], u) + plant.noise_mean() + jnp.asarray(coupling) @ x[n:]
-        return jnp.concatenate([moved, bias.transition(x[n:], pick @ u) + bias.noise_mean()])
-
-    # A linear plant stays one, unless its noise has a mean that a covariance by function cannot hold.
-    means = [model.noise.mean for model in (plant, bias) if isinstance(model.noise, AbstractNoise)]
-    if not isinstance(plant, LinearPlant) or not all(is_zero(mean) for mean in means):
-        return Plant(move, spread, *start, states, plant.inputs, circular)
-
-    def matrix(u: jax.Array) -> jax.Array:
-        below = [jnp.zeros((len(bias.states), n)), bias.transition_matrix(pick @ u)]
-        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], below])
-
-    def driven(u: jax.Array) -> jax.Array:
+    def drive(u: jax.Array) -> jax.Array:
         return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
 
-    return LinearPlant(matrix, spread, *start, driven, states, plant.inputs, circular)
+    return move, drive
+
+
+class Biased(Module):
+    """Measurement h(x) + D b of the state [x; b], of which the first `states` are x."""
+
+    sensor: AbstractSensor
+    loading: Array
+    states: int = eqx.field(static=True)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """The expected outputs."""
+        return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
 def _biased(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
     """The sensor of [x; b]."""
-    if isinstance(sensor, LinearSensor):
-        stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
-        return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
-
-    def measure(x: jax.Array) -> jax.Array:
-        return sensor.measure(x[:states]) + jnp.asarray(loading) @ x[states:]
-
-    return Sensor(measure, sensor.noise, sensor.outputs, sensor.circular)
+    if not isinstance(sensor, LinearSensor):
+        return Sensor(Biased(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
+    stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
+    return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
 
 
 def _of_each(name: str, value: ArrayLike, count: int) -> list[Any]:

@@ -15,10 +15,10 @@ from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets, held_maps, independent
 from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known
-from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
+from heliograph.random_affine.delay import Delay, Delayed, OfLine, Relayed, in_series, of_part, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant, LawLike
-from heliograph.random_affine.modes import Modes, OneStepLate
+from heliograph.random_affine.modes import ModeOutput, Modes, OneStepLate
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
@@ -283,6 +283,15 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             return tuple(int(start) + i for start, affine in items for i in carried(affine, sent))
         case Erasure() | OneStepLate() | Delayed():  # a time stamp of what is late stands after it
             return carried(held_maps(channel)[0], sent)
+        case OfLine():  # of what was sent at each of the steps that may arrive
+            size = channel.inputs // (1 + channel.past)
+            return carried(channel.line, tuple(t * size + i for t in range(1 + channel.past) for i in sent))
+        case ModeOutput():  # a class, of whatever is sent
+            return ()
+        case Relayed():
+            for stage in channel.stages:
+                sent = carried(stage, sent)
+            return sent
         # All choices must agree.
         case Mixture() | Modes():
             results = {carried(affine, sent) for affine in channel.maps}

@@ -12,14 +12,14 @@ import numpy as np
 from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, NoiseFunction, Plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, check_linear, check_sensor
-from heliograph.numerics.check import array, fail, function, instance, scalar, table
+from heliograph.numerics.check import array, fail, function, instance, names, scalar, table
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import library
-from heliograph.numerics.types import ArrayLike, Float
+from heliograph.numerics.types import ArrayLike, Float, renamed
 from heliograph.random_affine.delay import of_line
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped, Square, Vector
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Shaped
 
 
 def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
@@ -63,8 +63,9 @@ def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
     # Nothing was sent before the start.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
-    names = sensor.outputs
-    line = [f"{name}_{d}_ago" if d else f"{name}_sent" for d in range(past + 1) for name in names]
+    line = [
+        renamed(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs
+    ]
     return LinearPlant(
         xp.concatenate([moves, rest], axis=1),
         Shaped(enters, Independent([plant.noise, sensor.noise])),
@@ -116,31 +117,13 @@ class Stamped(AbstractSensor):
         return jnp.asarray(y - x[self.offset] * change)
 
 
-class Clocked(AbstractPlant):
-    """Nonlinear plant with offset and drift of clocks as further states."""
-
-    base: AbstractPlant
-    move: Matrix
-    noise: AbstractNoise | NoiseFunction
-    initial_mean: Vector
-    initial_covariance: Square
-    deviation: AbstractNoise | None
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-
-    def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """(f(x, u), offset + dt drift, drift)."""
-        n = len(self.base.states)
-        return jnp.concatenate([self.base.transition(x[:n], u), jnp.asarray(self.move) @ x[n:]])
-
-
 def with_clocks(
     plant: "AbstractPlant",
     sensors: "Mapping[str, AbstractSensor]",
     clocks: "Mapping[str, Clock]",
     motion: "Motion | Float[ArrayLike, 'n n']",
-    dt: "Float[ArrayLike, '']",
-) -> "tuple[LinearPlant | Plant | Clocked, dict[str, LinearSensor | Stamped]]":
+    dt: "Float[ArrayLike, ''] | str",
+) -> "tuple[LinearPlant | Plant, dict[str, LinearSensor | Stamped]]":
     """Return the plant with an offset and a drift for each clock as states, and the sensors of all nodes for it.
 
     A node of `clocks` stamps its values by its own clock, s = t + o, and a value is taken as one of its stamp. The
@@ -152,57 +135,63 @@ def with_clocks(
         sensors: sensor of each node, by its name.
         clocks: clock of each node that has one of its own.
         motion: dx/dt, a function of x or its matrix (n, n).
-        dt: time of a step, over which o grows by dt drift.
+        dt: time of a step, over which o grows by dt drift, or the name of the input that says it; wandering over a
+            step of varying time is white noise in the drift, of variance wander dt, integrated exactly.
 
     Raises:
-        ValueError: a clock whose node has no sensor, negative deviations, noise that depends on inputs, wrong shapes.
+        ValueError: a clock whose node has no sensor, negative deviations, another input, wrong shapes.
     """
     instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
     sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
-    n, step = len(plant.states), scalar("time of a step", dt, 0.0)
+    n = len(plant.states)
+    step = _step(plant, dt)
     if set(clocks) - set(sensors) or not clocks:
         raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
     for name, sensor in sensors.items():
         check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
     moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
     places = {name: n + 2 * i for i, name in enumerate(clocks)}
-    return _plant(plant, clocks, step), {
+    larger = driven_by(plant, _drifts(clocks, step), np.zeros((n, 2 * len(clocks))))
+    return larger, {
         name: _sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name)) for name, sensor in sensors.items()
     }
 
 
-def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Plant | Clocked:
-    if not isinstance(plant.noise, AbstractNoise):
-        raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
-    # Independent initial offset and drift of each clock; drift is a random walk.
-    spread, wander, start_at = [], [], []
+def _step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
+    """Return the time of a step, or the name of the plant's input that says it."""
+    if not isinstance(dt, str):
+        return scalar("time of a step", dt, 0.0)
+    if dt not in plant.inputs:
+        raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
+    return plant.inputs[plant.inputs.index(dt)]
+
+
+def _drifts(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
+    """Offset and drift of each clock: o+ = o + dt d, d+ = d + its wandering, all independent at the start."""
+    spread, wander, start_at, states = [], [], [], []
     for name, clock in clocks.items():
         start_at += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
         for field in ("offset", "drift", "wander"):
             scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
         spread += [clock.offset**2, clock.drift**2]
-        wander += [0.0, clock.wander]
-    # o+ = o + dt d, d+ = d.
-    move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
-    names = [f"{name}_{field}" for name in clocks for field in ("offset", "drift")]
-    if isinstance(plant, LinearPlant):
-        center = library(start_at).stack([library(start_at).asarray(x) for x in start_at])
-        drifting = LinearPlant(move, np.diag(wander), center, np.diag(spread), states=names)
-        return driven_by(plant, drifting, np.zeros((len(plant.states), len(move))))
-    law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
-    noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
-    xp = library(plant.initial_mean, start_at)
-    center = xp.concatenate([plant.initial_mean - law.mean, xp.stack([xp.asarray(x) for x in start_at])])
-    return Clocked(
-        base=plant,
-        move=move,
-        noise=noise,
-        initial_mean=center + start.mean,
-        initial_covariance=start.covariance,
-        deviation=start,
-        states=(*plant.states, *names),
-        inputs=plant.inputs,
-    )
+        wander.append(clock.wander)
+        offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
+        states += [renamed(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
+    center, start, strength = (library(x).asarray(library(x).stack(x)) for x in (start_at, spread, wander))
+    each, xp = np.eye(len(clocks)), library(start, strength)
+    start, strength = xp.diag(start), xp.diag(strength)
+    if not isinstance(dt, str):
+        noise = xp.kron(strength, np.diag([0.0, 1.0]))
+        return LinearPlant(np.kron(each, [[1.0, dt], [0.0, 1.0]]), noise, center, start, states=states)
+
+    def move(u: jax.Array) -> jax.Array:
+        return jnp.kron(each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
+
+    def gained(u: jax.Array) -> jax.Array:  # the integral of white noise in the drift, and of that in the offset
+        of_step = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
+        return jnp.kron(jnp.asarray(strength), of_step)
+
+    return LinearPlant(move, gained, center, start, states=states, inputs=[dt])
 
 
 def _sensor(
@@ -210,10 +199,15 @@ def _sensor(
 ) -> LinearSensor | Stamped:
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
-        return LinearSensor(matrix, sensor.noise, sensor.outputs)
-    stamped = motion if offset is not None else None
+        return LinearSensor(matrix, sensor.noise, sensor.outputs, sensor.circular)
     return Stamped(
-        base=sensor, noise=sensor.noise, motion=stamped, states=states, offset=offset or 0, outputs=sensor.outputs
+        base=sensor,
+        noise=sensor.noise,
+        motion=motion if offset is not None else None,
+        states=states,
+        offset=offset or 0,
+        outputs=sensor.outputs,
+        circular=sensor.circular,
     )
 
 
@@ -229,20 +223,31 @@ class JointSensor(AbstractSensor):
         return jnp.concatenate([sensor.measure(x) for sensor in self.parts])
 
 
-def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> JointSensor:
+def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | JointSensor:
     """Stack the sensors of nodes, in their order, as one; with `parallel` of their channels it serves a fusion centre.
+
+    Of linear sensors it is a linear one. Angles stay angles, and outputs keep their units.
 
     Args:
         sensors: by node; the outputs are named NODE_OUTPUT.
 
     Raises:
-        ValueError: no sensors, or one that varies.
+        ValueError: no sensors, or one that varies; nodes and outputs of which two make one name.
     """
     by_node = table("sensors", sensors, "sensors of nodes")
     if not by_node:
         raise fail("sensors", "at least one", "none")
     for name, sensor in by_node.items():
         instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary")
-    outputs = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.outputs)
-    noise = Independent([sensor.noise for sensor in by_node.values()])
-    return JointSensor(parts=tuple(by_node.values()), noise=noise, outputs=outputs)
+    outputs = [renamed(output, f"{name}_{output}") for name, sensor in by_node.items() for output in sensor.outputs]
+    outputs = list(names("outputs of all nodes", outputs, len(outputs), "y"))
+    circular = tuple(f"{name}_{output}" for name, sensor in by_node.items() for output in sensor.circular)
+    parts = tuple(by_node.values())
+    noise = Independent([sensor.noise for sensor in parts])
+    linear = [sensor.matrix for sensor in parts if isinstance(sensor, LinearSensor)]
+    if len(linear) < len(parts):
+        return JointSensor(parts=parts, noise=noise, outputs=tuple(outputs), circular=circular)
+    states = {matrix.shape[1] for matrix in linear}
+    if len(states) > 1:
+        raise fail("sensors", "those of one state", f"matrices of {sorted(states)} columns")
+    return LinearSensor(library(linear).concatenate(linear), noise, outputs, circular)

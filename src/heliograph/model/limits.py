@@ -9,11 +9,16 @@ from heliograph.numerics.check import fail, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
-LimitsLike = TypeAliasType("LimitsLike", ArrayLike | Sequence[Sequence[float | None]] | None)
+LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
 
 
 def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
-    """Limits of so many received numbers; None where there are none."""
+    """Limits of so many received numbers; those of another node as they are; None where there are none."""
+    if isinstance(limits, Limits):
+        if len(limits.low) != received or np.size(invalid):
+            got = f"those of {len(limits.low)}" + " and further codes" * bool(np.size(invalid))
+            raise fail("limits of another node", f"those of {received} received numbers, codes included", got)
+        return limits
     return None if limits is None and np.size(invalid) == 0 else Limits(received, limits, invalid)
 
 

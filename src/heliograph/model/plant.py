@@ -10,7 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
-from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
+from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module, readable
@@ -109,7 +109,7 @@ class AbstractPlant(Module):
 
     def noise_mean(self) -> jax.Array:
         """Mean of w, (n,)."""
-        if isinstance(self.noise, AbstractNoise):
+        if isinstance(self.noise, AbstractNoise | JointNoise):
             return jnp.asarray(self.noise.mean)
         return jnp.zeros(self.initial_mean.shape)
 
@@ -117,6 +117,8 @@ class AbstractPlant(Module):
         """Draw w."""
         if isinstance(self.noise, AbstractNoise):
             return self.noise.sample(key)
+        if isinstance(self.noise, JointNoise):
+            return self.noise.sample(key, u)
         return cholesky(self.noise_covariance(u)) @ jax.random.normal(key, self.initial_mean.shape, dtype=float)
 
     def sample_initial(self, key: jax.Array) -> jax.Array:
@@ -125,6 +127,35 @@ class AbstractPlant(Module):
             return jnp.asarray(self.initial_mean) - self.deviation.mean + self.deviation.sample(key)
         draw = jax.random.normal(key, self.initial_mean.shape, dtype=float)
         return jnp.asarray(self.initial_mean) + cholesky(jnp.asarray(self.initial_covariance)) @ draw
+
+
+class JointNoise(Module):
+    """Independent noises of two plants, one above the other, of which one depends on inputs: a covariance of the input.
+
+    Args:
+        plants: the plants.
+        places: places of each plant's inputs among all.
+    """
+
+    plants: tuple[AbstractPlant, ...]
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def _each(self, u: jax.Array) -> list[tuple[AbstractPlant, jax.Array]]:
+        return [(plant, jnp.asarray(u)[np.array(at, int)]) for plant, at in zip(self.plants, self.places, strict=True)]
+
+    def __call__(self, u: jax.Array) -> jax.Array:
+        """Covariance under the input u."""
+        return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in self._each(u))))
+
+    @property
+    def mean(self) -> jax.Array:
+        """Means of all."""
+        return jnp.concatenate([plant.noise_mean() for plant in self.plants])
+
+    def sample(self, key: jax.Array, u: jax.Array) -> jax.Array:
+        """Draw each plant's."""
+        keys = jax.random.split(key, len(self.plants))
+        return jnp.concatenate([p.sample_noise(k, own) for (p, own), k in zip(self._each(u), keys, strict=True)])
 
 
 class Plant(AbstractPlant):
@@ -286,6 +317,16 @@ def _initial(mean: ArrayLike, spread: NoiseLike) -> tuple[Vector, Square, Abstra
 
 
 AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime holds one plant per step
+
+
+def angles_among(angles: "Sequence[int] | AnyPlant", states: int) -> Angles:
+    """Return which of so many states are angles, from their places or from the plant whose states they are."""
+    plant = first(angles)
+    if not isinstance(plant, AbstractPlant):
+        return angles_at(angles, states)
+    if len(plant.states) != states:
+        raise fail("angles", f"those of a plant of {states} states", f"one of {list(plant.states)}")
+    return plant.angles
 
 
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:

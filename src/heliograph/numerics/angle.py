@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.check import fail, items
+from heliograph.numerics.check import array, fail, items
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array
 
@@ -29,6 +29,14 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
     if unknown or len(set(given)) < len(given):
         raise fail(name, f"some of {list(names)}, each once", given)
     return tuple(i for i, single in enumerate(names) if single in given)
+
+
+def angles_at(angles: object, size: int) -> Angles:
+    """Return places of angles among so many components, as a user lists them."""
+    which = array("angles", items("angles", angles, "places"), (None,)).tolist()
+    if not set(which) <= set(range(size)):
+        raise fail("angles", f"places from 0 to {size - 1}", which)
+    return tuple(map(int, which))
 
 
 def nearest(value: A, reference: Array, angles: Angles) -> A:

@@ -5,13 +5,14 @@ from typing import TypeVar
 
 import jax
 import numpy as np
-from scipy.linalg import block_diag
 
 from heliograph.filters.linear.linear import linear_filter
-from heliograph.model.channel import parallel
+from heliograph.model.channel import Channel, parallel
+from heliograph.model.enlarged import joint_sensor
 from heliograph.model.over_time import OverTime, at, first, over_time
-from heliograph.model.sensor import LinearSensor
+from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table
+from heliograph.numerics.module import same
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
@@ -29,7 +30,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     """Network whose transmitters send these powers, with the best linear filters behind them.
 
     Every node has the filter "best" behind its channel, and with several nodes "best" is also that of all that they
-    receive together.
+    receive together. Codes of sensors stay; limits of received numbers stay where a node's powers do, since others move
+    what is received.
 
     Args:
         network: the network as it is.
@@ -59,16 +61,13 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         for k, second in enumerate(seconds)
     ]
     channels = {name: _over_time([step[name] for step in steps]) for name in nodes}
-    designed = {
-        name: Node(node.sensor, channels[name], {BEST: linear_filter(plant, node.sensor, channels[name])})
-        for name, node in nodes.items()
-    }
+    designed = {name: _designed(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
         # All sensors and channels as one node, for the filter of all that is received.
         sensors = {name: node.sensor for name, node in nodes.items()}
         covered = min((sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)), default=1)
-        joint = _over_time([_joined({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
+        joint = _over_time([joint_sensor({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
         fused = {BEST: linear_filter(plant, joint, _over_time([parallel(list(step.values())) for step in steps]))}
     realised = Network(plant, designed, fused)
     return repeated(realised) if error.period > 1 else realised
@@ -99,6 +98,14 @@ def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str,
     }
 
 
+def _designed(plant: AnyPlant, node: Node, channel: Channel) -> Node:
+    """Return the node with this channel, and the best linear filter behind it."""
+    filters = {BEST: linear_filter(plant, node.sensor, channel)}
+    if node.limits is None or same(channel, node.channel):
+        return Node(node.sensor, channel, filters, node.limits)
+    return Node(node.sensor, channel, filters, invalid=node.limits.invalid)
+
+
 def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
     start = f"{name}."
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
@@ -107,12 +114,3 @@ def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int
 def _over_time(steps: Sequence[T]) -> T | OverTime:
     """A single object for ever, or an object for each step."""
     return steps[0] if len(steps) == 1 else over_time(steps)
-
-
-def _joined(sensors: Mapping[str, LinearSensor]) -> LinearSensor:
-    """All sensors as a single one, each output named by its node."""
-    return LinearSensor(
-        np.concatenate([np.asarray(s.matrix) for s in sensors.values()]),
-        block_diag(*(np.asarray(s.noise.covariance) for s in sensors.values())),
-        [f"{name} {output}" for name, s in sensors.items() for output in s.outputs],
-    )

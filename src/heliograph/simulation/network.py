@@ -29,6 +29,7 @@ from heliograph.simulation.node import (
     Common,
     Node,
     ReceivingNode,
+    check_angles,
     check_filters,
     check_flags,
     check_received,
@@ -156,6 +157,7 @@ class Network(Module):
                 check_sizes(f"fused {name!r}", fusion, self.states, self.inputs)
                 links = [first(node.channel) for node in self.nodes.values() if isinstance(node, Node)]
                 check_flags(f"fused {name!r}", fusion, links)
+                check_angles(f"fused {name!r}", fusion, self)
 
     @staticmethod
     def of_relays(

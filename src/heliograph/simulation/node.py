@@ -14,7 +14,7 @@ from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.rules import Fusion
-from heliograph.model.channel import Channel, check_sent
+from heliograph.model.channel import Channel, check_sent, received_angles
 from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import alike, first
@@ -22,6 +22,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, table
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
@@ -90,8 +91,8 @@ class Node(Module):
         channel: the true channel from the sensor to the filters.
         filters: filters by name.
         limits: range of an honest received number, (low, high) for all of them or a pair for each, None where there
-            is no limit. Recorded and live data outside count as not arrived, are counted and named. Claims stand as far
-            as no honest number is among them.
+            is no limit; or another node's `limits`, which hold its codes too. Recorded and live data outside count as
+            not arrived, are counted and named. Claims stand as far as no honest number is among them.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
             `event_filter`; all others take what was not sent for missing, and then claim "nominal" at most.
@@ -314,6 +315,34 @@ def check_sizes(name: str, filter: AbstractFilter, states: tuple[str, ...], inpu
     for what, single, theirs in (("states", states, filter.states), ("inputs", inputs, filter.inputs)):
         if len(single) != len(theirs):
             raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
+
+
+def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
+    """Refuse a filter of all nodes' measurements that takes for numbers on a line what are angles, or the reverse."""
+    used, angles = filter.angles_used(), first(network.plant).angles
+    if used is None:  # a filter of somebody else's
+        return
+    if used.states != angles:
+        expected, got = ([network.states[i] for i in places] for places in (angles, used.states))
+        raise fail(name, f"a filter whose angles are the plant's, {expected}", got)
+    if not filter.received:
+        return
+    # Angles among all that arrives, in the order of the nodes.
+    names = [f"{node}.{part}" for node in network.names for part in network.nodes[node].received_names]
+    expected, got = ([names[i] for i in places] for places in (_received_angles(network), used.received))
+    if expected != got:
+        raise fail(name, f"a filter that receives the nodes' angles, {expected}", got)
+
+
+def _received_angles(network: HasNodes) -> Angles:
+    if network.common is not None:
+        return received_angles(network.plant, network.common.sensor, network.common.channel)
+    places, start = [], 0
+    for node in (network.nodes[name] for name in network.names):
+        here = received_angles(network.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
+        places += [start + i for i in here]
+        start += node.received
+    return tuple(places)
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:

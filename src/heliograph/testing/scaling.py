@@ -60,8 +60,10 @@ def check_scaling(
     random = np.random.default_rng(seed)
     world = monte_carlo(_unreceived(network), steps, 1, seed, inputs=inputs)
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
-    for rows in z.values():
+    for name, rows in z.items():
         rows[random.random(rows.shape) < MISSING] = np.nan
+        if (limits := network.nodes[name].limits) is not None:  # which are those of its own units
+            rows[limits.outside(rows)] = np.nan
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, dtype=float)
     plain, worst = run(network, z, u).estimates, 0.0
     for _ in range(trials):

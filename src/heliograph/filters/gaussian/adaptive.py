@@ -6,7 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+)
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.robust import RobustFilter, expected_of, signal_without_noise
@@ -67,6 +75,10 @@ class AdaptiveFilter(AbstractSizedFilter):
     base: GaussianFilter | RobustFilter
     noise: ReceivedNoise | OverTime
     memory: Float[jax.Array | np.ndarray, ""]
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the filter within."""
+        return self.base.angles_used()
 
     @in_float64
     def init(self) -> AdaptiveBelief:

@@ -6,7 +6,15 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Transformed, linear_transform
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -37,6 +45,10 @@ class AbstractBeliefFilter(AbstractSizedFilter):
     transform: AbstractTransform
     initial_mean: Array
     initial_covariance: Array
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, ())
 
     @in_float64
     def init(self) -> Belief:

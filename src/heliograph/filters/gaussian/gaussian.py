@@ -4,7 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, sized
+from heliograph.filters.base import (
+    AbstractFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    sized,
+)
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.precise import (
@@ -51,6 +57,10 @@ class GaussianFilter(AbstractBeliefFilter):
     rule: AbstractUpdate
     linear: bool = eqx.field(static=True)
     observed_angles: Angles = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:

@@ -5,7 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import Step, corrects
+from heliograph.filters.base import (
+    FilterAngles,
+    Step,
+    corrects,
+)
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, prior_of
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
@@ -158,6 +162,10 @@ class RobustFilter(AbstractBeliefFilter):
     noise: ReceivedNoise | OverTime
     rule: AbstractWeights | None
     received_angles: Angles = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, self.received_angles)
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:

@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -29,6 +37,13 @@ class SequentialFilter(AbstractSizedFilter):
     """
 
     filters: tuple[GaussianFilter, ...]
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of the plant, and those of all nodes' measurements, one after another."""
+        starts = np.cumsum([0, *(filter.received for filter in self.filters)])
+        parts = [filter.angles_used() for filter in self.filters]
+        received = [int(start) + i for start, part in zip(starts, parts, strict=False) for i in part.received]
+        return FilterAngles(parts[0].states, tuple(received))
 
     @in_float64
     def init(self) -> Belief:
@@ -99,6 +114,9 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     sizes = [(len(filter.states), len(filter.inputs)) for filter in nodes]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)
+    angles = {filter.angles_used().states for filter in nodes}
+    if len(angles) != 1:
+        raise fail("sequential filter", "filters of one plant, whose angles are the same states", sorted(angles))
     weakest_claim = weakest([filter.claim for filter in nodes])
     return SequentialFilter(
         filters=nodes,

@@ -73,7 +73,8 @@ def without_mean(plant: AnyPlant) -> AnyPlant:
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
-    return LinearPlant(plant.matrix, about_mean(plant.noise), np.zeros(n), law, plant.input_matrix, plant.states)
+    noise, center = about_mean(plant.noise), np.zeros(n)
+    return LinearPlant(plant.matrix, noise, center, law, plant.input_matrix, plant.states, plant.inputs)
 
 
 def _matrix(model: AbstractPlant | AbstractSensor) -> np.ndarray:

@@ -11,7 +11,15 @@ import numpy as np
 import scipy
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.precise import above_rounding, initial_size
 from heliograph.filters.innovation import log_density, mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
@@ -180,6 +188,10 @@ class MixtureFilter(AbstractSizedFilter):
     components: Components | OverTime
     initial: Float[Array, " M"]
     observed_angles: Angles = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @property
     def of_atoms(self) -> bool:

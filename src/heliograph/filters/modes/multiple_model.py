@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.codegen.engine import compiled
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.belief import Belief, moments_around, predicted
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import corrected, signal_of
@@ -184,6 +192,10 @@ class MultipleModelFilter(AbstractSizedFilter):
     merging: AbstractMerging
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @compiled
     def init(self) -> ModalBeliefs:

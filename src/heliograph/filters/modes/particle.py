@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+)
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -57,6 +64,10 @@ class ParticleFilter(AbstractSizedFilter):
     observed_angles: Angles = eqx.field(static=True)
     particles: int = eqx.field(static=True)
     seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of its plant, and those that its channel delivers."""
+        return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @in_float64
     def init(self) -> Particles:

@@ -7,7 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.correction import Signal
 from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
@@ -68,6 +76,10 @@ class ClockFilter(AbstractSizedFilter):
 
     base: GaussianFilter
     offsets: tuple[int, ...] = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the filter within."""
+        return self.base.angles_used()
 
     @in_float64
     def init(self) -> ClockBelief:

@@ -10,7 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts, sized
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+    sized,
+)
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
@@ -69,6 +78,11 @@ class PartFilter(AbstractPartFilter):
     def __init__(self, base: AbstractFilter, states: int):
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received = base.inputs, base.received
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the larger filter among its first states."""
+        angles = self.base.angles_used()
+        return angles and angles._replace(states=tuple(i for i in angles.states if i < len(self.states)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """Mean and covariance of the first states after step k."""
@@ -215,6 +229,10 @@ class LateFilter(AbstractSizedFilter):
     def __init__(self, base: AbstractFilter, delay: int):
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the filter within."""
+        return self.base.angles_used()
 
     @in_float64
     def init(self) -> LateState:

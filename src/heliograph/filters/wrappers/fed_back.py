@@ -5,7 +5,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.base import (
+    AbstractFilter,
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    predicts,
+)
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
 from heliograph.filters.gaussian.precise import initial_size
@@ -41,6 +49,10 @@ class PredictionFilter(AbstractSizedFilter):
     def __init__(self, base: GaussianFilter):
         self.base, self.claim = base, base.claim
         self.states, self.inputs, self.received = base.states, base.inputs, base.received
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return those of the filter within."""
+        return self.base.angles_used()
 
     @in_float64
     def init(self) -> Ahead:

@@ -22,17 +22,15 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at_each_step, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
+from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.linalg import solve
 from heliograph.numerics.module import same
-from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.moments.second_moments import has_known_gain, has_random_gain, second_order
-from heliograph.random_affine.noise import Independent
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -53,16 +51,7 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     if any(isinstance(model, OverTime) for node in nodes for model in (node.sensor, node.channel)):
         raise fail("network to be learned", "one node, where its sensor or channel varies over time", len(nodes))
     sensors = {name: first(node.sensor) for name, node in zip(network.names, nodes, strict=True)}
-    return network.plant, _joined(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
-
-
-def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
-    parts = [sensor for sensor in sensors.values() if isinstance(sensor, LinearSensor)]
-    if len(parts) < len(sensors):
-        return joint_sensor(sensors)
-    matrices = [s.matrix for s in parts]
-    outputs = [f"{name}_{output}" for name, s in zip(sensors, parts, strict=True) for output in s.outputs]
-    return LinearSensor(library(matrices).concatenate(matrices), Independent([s.noise for s in parts]), outputs)
+    return network.plant, joint_sensor(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
 
 
 def _joint_channel(channel: Channel) -> Channel:

@@ -51,6 +51,9 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         raise _unfit("nodes that share a channel (give a function of free numbers)")
     # Second moments of the plant at each step, or in its steady state.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    deciding = [name for name, node in nodes.items() if node.trigger is not None]
+    if deciding:
+        raise fail("design", "senders that transmit at each step", f"triggers of {deciding}")
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
         if covered is not None:

@@ -1,11 +1,14 @@
 """Consistency of estimates and innovations on plain arrays: squared errors in units of what is claimed of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from heliograph.model.plant import AnyPlant, angles_among
+from heliograph.numerics.angle import angles_at, wrapped
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import squared_distance
@@ -48,7 +51,10 @@ class Consistency:
 
 
 def nees(
-    truth: Float[ArrayLike, "*steps n"], mean: Float[ArrayLike, "*steps n"], covariance: Float[ArrayLike, "*steps n n"]
+    truth: Float[ArrayLike, "*steps n"],
+    mean: Float[ArrayLike, "*steps n"],
+    covariance: Float[ArrayLike, "*steps n n"],
+    angles: "Sequence[int] | AnyPlant" = (),
 ) -> Float[np.ndarray, "*steps"]:
     """Return the normalised estimation error squared (NEES), e' P^-1 e with e = truth - mean: one number a step.
 
@@ -59,20 +65,22 @@ def nees(
         truth: true states, NaN where a component is not known: the others are judged, by their part of P.
         mean: estimates, NaN where there is none.
         covariance: what is claimed of their errors, one (n, n) for all steps or one a step.
+        angles: which states are angles in radians, whose errors are between -pi and pi: by place, or the plant whose
+            states they are; none by default.
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite.
+        ValueError: shapes that do not fit, numbers that are not finite, angles that are no places in the state.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _squared(x - m, _of_each(covariance, x), x)
+    return _squared(wrapped(x - m, angles_among(angles, x.shape[-1])), _of_each(covariance, x), x)
 
 
 def nis(
-    innovation: Float[ArrayLike, "*steps m"], covariance: Float[ArrayLike, "*steps m m"]
+    innovation: Float[ArrayLike, "*steps m"], covariance: Float[ArrayLike, "*steps m m"], angles: Sequence[int] = ()
 ) -> Float[np.ndarray, "*steps"]:
     """Return the normalised innovation squared (NIS), e' S^-1 e of an innovation e: one number a step, without a truth.
 
@@ -82,15 +90,17 @@ def nis(
     Args:
         innovation: z - E[z | earlier z], NaN for what did not arrive: `filter.run(z).innovations`.
         covariance: its covariance, one (m, m) or one a step: `filter.run(z).innovation_covariances`.
+        angles: which components are angles in radians, by place; none by default, as a filter's own innovations are
+            between -pi and pi already.
 
     Raises:
-        ValueError: shapes that do not fit, infinite numbers.
+        ValueError: shapes that do not fit, infinite numbers, angles that are no places in the innovation.
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001), section 5.4.
     """
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
-    return _squared(e, _of_each(covariance, e), np.zeros_like(e))
+    return _squared(wrapped(e, angles_at(angles, e.shape[-1])), _of_each(covariance, e), np.zeros_like(e))
 
 
 def _of_each(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
