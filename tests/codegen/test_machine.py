@@ -1,6 +1,9 @@
 """Code in haste, and with care once its executions have cost as much: the same bits."""
 
 import gc
+import signal
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
 import jax
@@ -131,3 +134,51 @@ def test_code_lets_go_of_the_program_that_it_was_made_of():
     code(STARTS)
     assert nodes() == before
     assert "define void @run" in code.code.blocks.text(8)
+
+
+def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypatch):
+    """Freed, it would be another's: a heap that is written over ends the process, or changes numbers."""
+    code(STARTS)
+    begun, released, made = Event(), Event(), []
+
+    class Slow:
+        width = code.width
+
+        def run(self, *_):
+            begun.set()
+            released.wait(60)
+
+    def interrupted():
+        made.extend(weakref.ref(item) for item in (machine, *arguments))
+        begun.wait(60)
+        signal.raise_signal(signal.SIGINT)
+
+    machine, arguments = Slow(), [STARTS.copy()]
+    monkeypatch.setattr(code.blocks, "machine", lambda blocks, held=[machine]: held.pop())
+    monkeypatch.setattr(compiled, "threads", lambda: Interrupted(interrupted))
+    monkeypatch.setattr(compiled, "LITTLE", 0)
+    before, stopped = signal.signal(signal.SIGINT, signal.default_int_handler), False
+    try:
+        code(*arguments)
+    except KeyboardInterrupt:
+        stopped = True
+    finally:
+        signal.signal(signal.SIGINT, before)
+    del machine, arguments
+    gc.collect()
+    assert stopped and len(made) == 2
+    assert all(item() is not None for item in made)
+    released.set()
+    background().submit(int).result()
+
+
+class Interrupted:
+    """Threads whose results are waited for until a Ctrl-C."""
+
+    def __init__(self, interrupt):
+        self.pool, self.interrupt = ThreadPoolExecutor(1), interrupt
+
+    def map(self, function, arguments):
+        futures = [self.pool.submit(function, item) for item in arguments]
+        self.interrupt()
+        return [future.result() for future in futures]

@@ -6,14 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.llvm.module import LINE, Code, written
-from heliograph.codegen.machine import LONG, WIDEST, Function, Machine, Tiers, features, narrow
+from heliograph.codegen.machine import LONG, WIDEST, Machine, Tiers, features, generated, narrow
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
@@ -68,24 +68,19 @@ class Compiled:
             once.run(pointers.ctypes.data, 0, 0, 1, 1)
             self._copy_common(outputs, shared)
         if not all(code.common):
-            self._run(pointers, runs, cores)
+            memory = arrays, code.tables, outputs, shared
+            self._run(Call(self.blocks.machine(-(-runs // self.width)), pointers, memory, runs), cores)
         return jax.tree.unflatten(self.tree, outputs)
 
-    def _run(self, pointers: np.ndarray, runs: int, cores: int | None) -> None:
-        machine = self.blocks.machine(-(-runs // self.width))
-        run, blocks = machine.run, -(-runs // machine.width)
+    def _run(self, call: "Call", cores: int | None) -> None:
+        blocks, scratch = -(-call.runs // call.machine.width), self.code.scratch
         if cores == 1 or blocks * self.code.blocks.work < LITTLE:
-            self._blocks(run, pointers, 0, blocks, runs)
+            call.compute(0, blocks, scratch)
             return
         cores = cores or cpu_count()
         share = -(-blocks // (cores * SHARES))
         starts = range(0, blocks, share)
-        list(threads().map(lambda start: self._blocks(run, pointers, start, min(start + share, blocks), runs), starts))
-
-    def _blocks(self, run: Function, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
-        """Compute blocks of runs in this thread."""
-        scratch = aligned(self.code.scratch)
-        run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
+        list(threads().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         for array, common, offset, buffer in zip(
@@ -94,6 +89,23 @@ class Compiled:
             if common:
                 size = buffer.size * array.itemsize
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
+
+
+class Call(NamedTuple):
+    """Code and all the memory of one call, held by each thread that computes a part of it.
+
+    Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
+    """
+
+    machine: Machine
+    pointers: np.ndarray
+    memory: Any
+    runs: int
+
+    def compute(self, begin: int, end: int, scratch: int) -> None:
+        """Compute blocks of runs in this thread, with so many bytes of its own."""
+        own = aligned(scratch)
+        self.machine.run(self.pointers.ctypes.data, own.ctypes.data, begin, end, self.runs)
 
 
 class Alone:
@@ -105,7 +117,7 @@ class Alone:
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
         self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
         level = int(self.code.operations <= LONG)
-        self.machine, self.tree, self._in_place = Machine(self.code.blocks, level, 1), program.tree, in_place
+        self.machine, self.tree, self._in_place = generated(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._place([])
 

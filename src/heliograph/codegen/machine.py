@@ -4,7 +4,7 @@ import ctypes
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from threading import Lock
+from threading import Lock, current_thread, main_thread
 
 import jax
 import llvmlite.binding as llvm
@@ -85,6 +85,22 @@ def background() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
+@cache
+def _hasty() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1)
+
+
+def generated(source: Source, level: int, width: int) -> Machine:
+    """Generate code outside of the main thread, and wait for it.
+
+    Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
+    there could change its owner and nobody note it, and be freed twice.
+    """
+    if current_thread() is not main_thread():
+        return Machine(source, level, width)
+    return _hasty().submit(Machine, source, level, width).result()
+
+
 class Tiers:
     """Code of one text, generated again with care when its executions have cost as much as that.
 
@@ -106,7 +122,7 @@ class Tiers:
             pays = often(source.operations)
             level = int(self._executions >= pays and not jax.config.values["jax_disable_most_optimizations"])
             if self._machine is None:
-                self._machine = Machine(source, level, self._widths[level])
+                self._machine = generated(source, level, self._widths[level])
             elif self._machine.level < level:
                 self._careful = self._careful or background().submit(Machine, source, level, self._widths[level])
                 if executions >= pays or self._careful.done():

@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
 
+from heliograph.codegen.compiled import threads
 from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.float64 import fully_optimised, to_numpy
@@ -59,16 +59,15 @@ def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: in
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], outputs)
 
     # Each core computes its blocks, then copies them to their place.
-    with ThreadPoolExecutor(cores) as pool:
-        computed = list(pool.map(work, range(-(-runs // (share * width)))))
-        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
+    computed = list(threads().map(work, range(-(-runs // (share * width)))))
+    whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
-        def copy_back(core: int) -> None:  # copied by all cores too: large results take their time
-            into, blocks = jax.tree.leaves(whole), jax.tree.leaves(computed[core])
-            for target, leaf in zip(into, blocks, strict=True):
-                target[core * share * width :][: len(leaf)] = leaf
+    def copy_back(core: int) -> None:  # copied by all cores too: large results take their time
+        into, blocks = jax.tree.leaves(whole), jax.tree.leaves(computed[core])
+        for target, leaf in zip(into, blocks, strict=True):
+            target[core * share * width :][: len(leaf)] = leaf
 
-        list(pool.map(copy_back, range(len(computed))))
+    list(threads().map(copy_back, range(len(computed))))
     return whole
 
 
