@@ -47,6 +47,10 @@ class ServeOptions:
         Parameter(help="Node of a fusion between neighbours that this process is; its messages go by the broker."),
     ] = None
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None
+    host: Annotated[
+        list[str] | None,
+        Parameter(help="Name by which others ask for the page, as of a proxy; may be given again.", negative=""),
+    ] = None
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False
 
     def settings(self, reference: str) -> "ServiceSettings":
@@ -69,6 +73,7 @@ class ServeOptions:
             broker=broker,
             parts=self.parts,
             page=self.page,
+            hosts=tuple(self.host or ()),
             anew=tuple(self.anew or ()),
             sources=module.get("sources"),
             name=name_of(reference),

@@ -5,8 +5,9 @@ import hmac
 import ipaddress
 import json
 import os
+import re
 import socket
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from typing import NamedTuple
@@ -26,21 +27,24 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from heliograph.live.event import VERDICTS
 from heliograph.numerics.check import fail
 from heliograph.report.outputs import output_numbers
-from heliograph.serving.watch import Watch
+from heliograph.serving.overview import page_of
+from heliograph.serving.watch import LISTED, Watch
 
 
 class Tallies(Collector):
-    """Collector of the numbers of a watch, by node and filter; not by plant, of which there may be many."""
+    """Collector of the numbers of a watch, by node and filter, and by plant where there are few, else of the worst."""
 
     def __init__(self, watch: Watch):
         self.watch = watch
         watch.registry.register(self)
+        self._last = b""
 
     def collect(self) -> Iterable[Metric]:
         """Yield the current metrics."""
         yield from _links(self.watch)
         yield from _nis(self.watch)
         yield from _outputs(self.watch)
+        yield from _by_plant(self.watch)
         yield _fused(self.watch)
         yield _dead(self.watch)
         yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
@@ -48,9 +52,34 @@ class Tallies(Collector):
         yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
 
     def text(self) -> bytes:
-        """Return all metrics as text."""
-        with self.watch.lock:
-            return generate_latest(self.watch.registry)
+        """Return all metrics as text; while a batch takes long, as where programs compile, those before it."""
+        if self.watch.lock.acquire(timeout=PATIENCE if self._last else -1.0):
+            try:
+                self._last = generate_latest(self.watch.registry)
+            finally:
+                self.watch.lock.release()
+        return self._last
+
+
+def _by_plant(watch: Watch) -> Iterable[Metric]:
+    """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
+    worst, labels = watch.worst(), ["plant", "node", "filter"]
+    wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
+    wrong.add_metric(["dead sender"], sum(bool(item.dead) for item in worst))
+    wrong.add_metric(["doubted claim"], sum(bool(item.doubts) for item in worst))
+    wrong.add_metric(["refused messages"], sum(bool(item.refused) for item in worst))
+    families = [GaugeMetricFamily(f"heliograph_plant_{name}", words, labels=labels) for name, words in NIS.items()]
+    dead = GaugeMetricFamily("heliograph_plant_dead_sender", "1: its sender is dead.", labels=["plant", "node"])
+    names = [name for name, _ in watch.plants()]
+    shown = names if len(names) <= SHOWN else [item.plant for item in worst[:SHOWN]]
+    for plant in dict.fromkeys(shown):
+        for key, test in watch.tests(plant).items():
+            for family, value in zip(families, (test.ratio, *test.band()), strict=True):
+                family.add_metric([plant, *key], value)
+    for item in worst[:SHOWN]:
+        for node in item.dead:
+            dead.add_metric([item.plant, node], 1.0)
+    return wrong, *families, dead
 
 
 def _links(watch: Watch) -> Iterable[Metric]:
@@ -117,8 +146,18 @@ def _outputs(watch: Watch) -> Iterable[Metric]:
     return metrics.values()
 
 
+SHOWN = 50  # plants with metrics of their own; of more the worst
+PATIENCE = 1.0  # seconds that a batch may take before the metrics before it are told
+STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
+NIS = {
+    "nis": "Normalised innovation squared of what a filter used over its expectation, of a plant's last rows; 1.",
+    "nis_low": "Least that is expected of an honest filter.",
+    "nis_high": "Most that is expected of an honest filter.",
+}
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"
+HEALTH = "/healthz"
 EVERY = 0.5  # seconds between looks
+NAME = re.compile(r"[A-Za-z0-9._-]+|\[[0-9a-fA-F:.]+\]")
 LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
 KINDS = {"page.css": "text/css", "page.js": "text/javascript"}
 POLICY = {
@@ -131,29 +170,42 @@ POLICY = {
 
 
 class Door(NamedTuple):
-    """Address of the page, and the token that is required there (None: only this machine can reach it)."""
+    """Address of the page, the token that is required there, and the names by which it is asked for.
+
+    Without a token only this machine can reach it. `hosts`: names besides those of this machine, such as a proxy's.
+    """
 
     host: str
     port: int
     token: str | None
+    hosts: tuple[str, ...] = ()
 
 
-def door(address: str, environment: Mapping[str, str] | None = None) -> Door:
-    """`PORT`, of this machine alone, or `ADDRESS:PORT`, which takes a token from HELIOGRAPH_PAGE_TOKEN.
+def door(address: str, environment: Mapping[str, str] | None = None, hosts: Sequence[str] = ()) -> Door:
+    """`PORT`, of this machine alone, or `ADDRESS:PORT`; a token in HELIOGRAPH_PAGE_TOKEN holds at either.
+
+    Args:
+        address: the address.
+        environment: environment variables; by default those of the process.
+        hosts: names by which a proxy or others ask for the page, without a port.
 
     Raises:
-        ValueError: no such address; one that others can reach without a token of at least 16 characters.
+        ValueError: no such address; one that others can reach without a token; a token of less than 16 characters; a
+            name that is none.
     """
     host, _, port = address.rpartition(":")
     host = host.strip("[]") or "127.0.0.1"
     if not (port.isascii() and port.isdigit() and int(port) < 65536):
         raise fail("page", "a port, or address:port", repr(address))
-    if _is_loopback(host):
-        return Door(host, int(port), None)
+    for name in hosts:
+        if not NAME.fullmatch(name):
+            raise fail("page, host", "a name without scheme and port, such as pages.example.org", repr(name))
     token = (os.environ if environment is None else environment).get(TOKEN, "")
+    if _is_loopback(host) and not token:
+        return Door(host, int(port), None, tuple(hosts))
     if len(token) < 16:
         raise fail(f"page at {host}", f"a token of 16 characters at least in {TOKEN}", f"one of {len(token)}")
-    return Door(host, int(port), token)
+    return Door(host, int(port), token, tuple(hosts))
 
 
 def _is_loopback(host: str) -> bool:
@@ -163,13 +215,18 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def application(watch: Watch, token: str | None, stopped: asyncio.Event) -> Starlette:
-    """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics."""
+def application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
+    """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics.
+
+    Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
+    """
     tallies = Tallies(watch)
 
     # The first view is written into the page; all others come from /events.
-    def page(_: Request) -> Response:
-        first = json.dumps(watch.view(None)).replace("<", "\\u003c")  # no name ends the element that it stands in
+    def page(request: Request) -> Response:
+        first = json.dumps(watch.view(request.query_params.get("plant"))).replace(
+            "<", "\\u003c"
+        )  # no name ends the element that it stands in
         return Response(_text("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
     def metrics(_: Request) -> Response:
@@ -178,11 +235,25 @@ def application(watch: Watch, token: str | None, stopped: asyncio.Event) -> Star
     def events(request: Request) -> Response:
         return StreamingResponse(_events(watch, request, stopped), media_type="text/event-stream")
 
-    # The token is checked for every route.
+    def plants(_: Request) -> Response:
+        with watch.lock:
+            text = page_of(watch.title, {name for name, _ in watch.plants()}, watch.worst(), LISTED)
+        return Response(text, media_type="text/html", headers=POLICY)
+
+    # It says only that the service serves, so that it needs no token.
+    def health(_: Request) -> Response:
+        busy = watch.busy()
+        if busy > STUCK:
+            return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)
+        return PlainTextResponse("ok")
+
+    # The token is checked for every other route.
     middleware = [Middleware(Guarded, token)]
-    if token is None:  # a page of elsewhere that names itself 127.0.0.1 does not get in
-        middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK, www_redirect=False))
-    routes = [Route("/", page), Route("/metrics", metrics), Route("/events", events)]
+    if token is None or hosts:  # a page of elsewhere that names itself 127.0.0.1 does not get in
+        allowed = [*LOOPBACK, *hosts]
+        middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=allowed, www_redirect=False))
+    routes = [Route("/", page), Route("/metrics", metrics), Route("/events", events), Route("/plants", plants)]
+    routes.append(Route(HEALTH, health))
     return Starlette(routes=[*routes, *(Route(f"/{name}", file) for name in KINDS)], middleware=middleware)
 
 
@@ -216,7 +287,7 @@ class Guarded:
         self.app, self.token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or self.token is None:
+        if scope["type"] != "http" or self.token is None or scope["path"] == HEALTH:
             await self.app(scope, receive, send)
             return
         requested = HTTPConnection(scope)
@@ -261,7 +332,10 @@ async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
         raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {why}") from None
     stopped = asyncio.Event()
     config = uvicorn.Config(
-        application(watch, at.token, stopped), log_level="warning", access_log=False, timeout_graceful_shutdown=3
+        application(watch, at.token, stopped, at.hosts),
+        log_level="warning",
+        access_log=False,
+        timeout_graceful_shutdown=3,
     )
     server = _Page(config)
     serving = asyncio.ensure_future(server.serve([listener]))

@@ -144,6 +144,7 @@ class ServiceSettings:
         broker: the broker; None reads standard input.
         parts: number of parts of the plants that several processes share.
         page: port, or address and port, of the page.
+        hosts: names by which others ask for the page, such as a proxy's.
         anew: names of plants that begin anew.
         sources: sources of messages that others make, by topic; None reads messages in our own form alone.
         name: name of the network on the page.
@@ -163,6 +164,7 @@ class ServiceSettings:
     broker: Address | None = None
     parts: int | None = None
     page: str | None = None
+    hosts: tuple[str, ...] = ()
     anew: tuple[str, ...] = ()
     sources: object = None
     name: str = ""
@@ -170,6 +172,8 @@ class ServiceSettings:
     every: float | None = None
 
     def __post_init__(self) -> None:
+        if self.hosts and self.page is None:
+            raise fail("--host", "a page that is asked for by this name (--page PORT)", "none")
         if self.every is not None:
             scalar("--every", self.every, TINY)
         if self.snapshot is not None:
@@ -260,7 +264,7 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
     from heliograph.serving.watch import watch_of
 
     watch = watch_of(settings.network, settings.name)
-    async with shown(watch, door(settings.page)):
+    async with shown(watch, door(settings.page, hosts=settings.hosts)):
         yield watch.over
 
 

@@ -1,6 +1,9 @@
 """Running test of a covariance: the NIS of the newest rows of a filter, and the band in which it should be."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from scipy.special import gammaincinv
 
@@ -8,6 +11,7 @@ from heliograph.model.estimate import Claim
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
 FEWEST = 20  # received components before a test is made
+WEIGHED, HALF = ("value", "variance", "weight"), 0.5  # from this weight on a number was used
 DOUBT = 0.001  # how often an honest filter is outside its band
 
 
@@ -57,3 +61,17 @@ class RunningNis:
         if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
             return f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
         return None
+
+
+def used_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
+    """Return the squared innovation of what a filter used, and of how many numbers it is.
+
+    Of a filter that weighs these are the numbers of weight 1/2 or more, each over its variance: outliers that it left
+    out do not count against it.
+    """
+    outputs = message.get("outputs")
+    if message.get("nis") is None or not outputs:
+        return message.get("nis"), message.get("received", 0)
+    used = [value**2 / variance for value, variance, weight in zip(*(outputs[name] for name in WEIGHED), strict=True)
+            if None not in (value, variance, weight) and weight >= HALF and variance > 0]  # fmt: skip
+    return (math.fsum(used), len(used)) if used else (None, 0)

@@ -3,7 +3,9 @@
 import math
 import threading
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from time import monotonic
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from prometheus_client import CollectorRegistry, Histogram
@@ -18,16 +20,20 @@ from heliograph.report.outputs import RecentOutputs, output_row
 from heliograph.serving.loop import Takes
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
-from heliograph.serving.running_nis import MEMORY, RunningNis
+from heliograph.serving.overview import Overview, Wrong
+from heliograph.serving.running_nis import MEMORY, RunningNis, used_nis
+from heliograph.serving.totals import Link, Totals
 from heliograph.simulation.description.diagram import listed
 from heliograph.simulation.network import FUSED, Network
 
 T = TypeVar("T")
 PLANTS = 200  # plants with estimates in memory, those with the newest messages
+TESTED = 20_000  # plants whose claims are tested, those with the newest messages
 POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
 APART = 3  # nodes that have a warning each; more of the same kind have one together
+REFUSED = "late", "future", "implausible", "conflict"
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
 
 
@@ -38,25 +44,6 @@ COUNTED = {  # of a node's messages
     "dropped": "values are beyond its limits, or codes, and count as not arrived",
     "conflict": "came again with other values; the first stayed",
 }
-
-
-class Link(Protocol):
-    """Counts of the messages of a node.
-
-    Attributes:
-        lost: gaps in the node's running count.
-        dropped: single values beyond limits.
-        used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
-    """
-
-    lost: int
-    dropped: int
-    used: int
-    duplicate: int
-    conflict: int
-    late: int
-    future: int
-    implausible: int
 
 
 class Plant(Protocol):
@@ -143,6 +130,8 @@ class Watch:
         self._outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
         self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
+        self.totals, self._overview, self._dead = Totals(), Overview(), dict[str, list[str]]()
+        self._begun: float | None = None  # of the batch that is being taken
         self._senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is published.", registry=self.registry)
@@ -155,12 +144,27 @@ class Watch:
         self.services.append(service)
         return Watched(service, self)
 
+    @contextmanager
+    def taking(self) -> Iterator[None]:
+        """Hold the lock for a batch."""
+        with self.lock:
+            self._begun = monotonic()
+            try:
+                yield
+            finally:
+                self._begun = None
+
     def note(self, outputs: Sequence[Output], last: Taken | None) -> None:
         """Record the outputs and statistics of a batch; None where nothing came."""
         if last is not None:
             self.took.observe(last.took)
             self.committed.observe(last.committed)
             self.lag.observe(last.lag)
+        plants = {output.plant for output in outputs}
+        for name, plant in self._named(plants):
+            self.totals.add(name, plant.links)
+        for name in plants:
+            self._overview.touch(name)
         for output in outputs:
             if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
@@ -169,14 +173,15 @@ class Watch:
                     self._test(output.plant, message["estimates"])
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        of_plant = _newest(self._tests, plant, dict)
+        of_plant = _newest(self._tests, plant, dict, TESTED)
         recent = self.outputs, _newest(self._outputs, plant, lambda: RecentOutputs(MEMORY, self.outputs.names))
         for node, filters in estimates.items():
             for name, message in filters.items():
-                if message.get("nis") is not None:
+                squared, received = used_nis(message)
+                if squared is not None:
                     for tests in (self.nis, of_plant):
                         single = tests.setdefault((node, name), RunningNis(message["claim"]))
-                        single.add(message["nis"], message["received"])
+                        single.add(squared, received)
                 if message.get("outputs") and message.get("received"):
                     for outputs in recent:
                         outputs.add(node, name, message["outputs"])
@@ -191,15 +196,43 @@ class Watch:
         points.append(Point(self._count, message["time"], message["kind"] == "final", estimates))
         if message.get("senders"):
             _newest(self._senders, plant, dict).update(message["senders"])
+            self._dead[plant] = [node for node, sender in message["senders"].items() if sender["dead"]]
+            if not self._dead[plant]:
+                del self._dead[plant]
 
     def plants(self) -> Iterator[tuple[str, Plant]]:
         """Yield all plants of all services."""
         for service in self.services:
             yield from service.plants.items()
 
+    def _named(self, names: Collection[str]) -> Iterator[tuple[str, Plant]]:
+        """Yield the plants of these names."""
+        for service in self.services:
+            yield from ((name, service.plants[name]) for name in names if name in service.plants)
+
     def links(self) -> dict[str, dict[str, int]]:
-        """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits."""
-        return _added(plant for _, plant in self.plants())
+        """Sum the counts over all plants, by node: messages by verdict, lost ones, and values beyond limits.
+
+        Also of plants that have left the memory.
+        """
+        return self.totals.as_table()
+
+    def worst(self) -> list[Wrong]:
+        """Return the plants with something wrong, the worst first."""
+        refused = dict[str, str]()
+        for name, plant in self._named(self._overview.touched):
+            refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, link in plant.links.items()
+                                      for verdict in REFUSED if (count := getattr(link, verdict)))  # fmt: skip
+        return self._overview.worst(self._tests, self._dead, refused)
+
+    def tests(self, plant: str) -> Mapping[tuple[str, str], RunningNis]:
+        """Return the tests of a plant's claims."""
+        return self._tests.get(plant, {})
+
+    def busy(self) -> float:
+        """Return for how many seconds the present batch is being taken; 0 where there is none."""
+        begun = self._begun
+        return 0.0 if begun is None else monotonic() - begun
 
     def dead_senders(self) -> Mapping[str, int]:
         """Count the plants that have a dead sender, by node with a trigger, over all services."""
@@ -236,7 +269,8 @@ class Watch:
                 "outputs": [output_row(output) for output in health],
                 "warnings": list(self._warnings(results, tests, senders))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
-                "all": _added(status for _, status in self.plants()),
+                "all": self.links(),
+                "wrong": len(self.worst()),
             }
 
     def fused_rows(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
@@ -287,7 +321,7 @@ class Watched:
 
     def take(self, payloads: Sequence[Payload]) -> list[Output]:
         """Let the service take a batch, and record its outputs."""
-        with self.watch.lock:
+        with self.watch.taking():
             outputs = self.service.take(payloads)
             self.watch.note(outputs, self.service.last if payloads else None)
         return outputs
@@ -302,11 +336,11 @@ class Watched:
             return self.service.finish(ended)
 
 
-def _newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
-    """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond PLANTS."""
+def _newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:
+    """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond so many."""
     if plant not in newest:
         newest[plant] = make()
-        if len(newest) > PLANTS:
+        if len(newest) > most:
             newest.popitem(last=False)
     newest.move_to_end(plant)
     return newest[plant]

@@ -4,7 +4,7 @@ const POINTS = 400;
 const at = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const MANY = 12; // rows of a table that can be read without a search
-let points = [], source = null, plant = null, chosen = null, last = null;
+let points = [], source = null, plant = new URLSearchParams(location.search).get("plant"), chosen = null, last = null;
 
 function made(tag, text, name) {
   const element = document.createElement(tag);
@@ -103,8 +103,13 @@ function keys(view) {
     ["too late", sum("late", all)], ["copies", sum("duplicate", all)], ["implausible", sum("implausible", all)],
     ["not readable", view.malformed]];
   at("keys").replaceChildren(...rows.map(([name, value]) => {
-    const key = made("div", undefined, "key");
-    key.append(made("dt", name), made("dd", value.toLocaleString("en")));
+    const key = made("div", undefined, "key"), shown = made("dd", value.toLocaleString("en"));
+    if (name === "plants" && value > 1) {  // all of them, the worst first
+      const link = made("a", shown.textContent + (view.wrong ? " (" + view.wrong.toLocaleString("en") + " wrong)" : ""));
+      link.href = "plants";
+      shown.replaceChildren(link);
+    }
+    key.append(made("dt", name), shown);
     return key;
   }));
 }

@@ -1,0 +1,55 @@
+"""Counts over all plants that a service has taken messages of, whichever of them are in memory."""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Protocol
+
+from heliograph.live.event import VERDICTS
+
+COUNTS = (*VERDICTS, "dropped")  # which never fall
+FIELDS = (*COUNTS, "lost")
+
+
+class Link(Protocol):
+    """Counts of the messages of a node.
+
+    Attributes:
+        lost: gaps in the node's running count.
+        dropped: single values beyond limits.
+        used, duplicate, conflict, late, future, implausible: numbers of messages by verdict.
+    """
+
+    lost: int
+    dropped: int
+    used: int
+    duplicate: int
+    conflict: int
+    late: int
+    future: int
+    implausible: int
+
+
+class Totals:
+    """Sums of counts over plants, by node; a plant that leaves the memory takes nothing with it.
+
+    `by_node` has the counts of messages by verdict, of dropped values, and of lost messages, which may fall.
+    """
+
+    def __init__(self) -> None:
+        self.by_node: dict[str, Counter[str]] = {}
+        self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
+
+    def add(self, plant: str, links: Mapping[str, Link]) -> None:
+        """Add what has changed in a plant's counts since they were added last."""
+        for node, link in links.items():
+            now = tuple(getattr(link, name) for name in FIELDS)
+            before = self._seen.get((plant, node), (0,) * len(FIELDS))
+            if now != before:
+                self._seen[plant, node] = now
+                total = self.by_node.setdefault(node, Counter(dict.fromkeys(FIELDS, 0)))
+                for name, new, old in zip(FIELDS, now, before, strict=True):
+                    total[name] += new - old if name == "lost" else max(new - old, 0)
+
+    def as_table(self) -> dict[str, dict[str, int]]:
+        """Return the sums by node and count."""
+        return {node: dict(total) for node, total in self.by_node.items()}
