@@ -1,3 +1,4 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -35,6 +36,28 @@ class _Overconfident(hg.fusion.WeightedFusion):
 def test_the_check_finds_a_bound_that_is_none():
     with pytest.raises(AssertionError, match="identical bounds"):
         check_fusion(_Overconfident([0.2, 0.3, 0.5]))
+
+
+class _InverseByHalves(hg.fusion.InverseCovarianceIntersection):
+    """Inverse intersection with weight 1/2, two at a time, as if its covariance were a bound for all correlations."""
+
+    def claim(self, claims):
+        return weakest([*claims, "upper"])
+
+    def combine(self, means, covariances):
+        mean, spread = means[0], covariances[0]
+        for other, q in zip(means[1:], covariances[1:], strict=True):
+            common = jnp.linalg.inv((spread + q) / 2)
+            fused = jnp.linalg.inv(jnp.linalg.inv(spread) + jnp.linalg.inv(q) - common)
+            gain = fused @ (jnp.linalg.inv(q) - common / 2)
+            mean, spread = mean + gain @ (other - mean), fused
+        return mean, spread
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_check_finds_inverse_intersection_no_bound_for_every_correlation(seed):
+    with pytest.raises(AssertionError, match="bound: expected an upper one"):
+        check_fusion(_InverseByHalves(), seed=seed)
 
 
 def test_weighted_fusion_by_hand():
