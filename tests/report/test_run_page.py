@@ -24,15 +24,15 @@ PLANT = hg.LinearPlant(DRIFT, [[1.0]], [0.0], [[10.0]], states=["level"])
 SENSOR = hg.LinearSensor([[1.0], [1.0]], 0.1 * np.eye(2), outputs=["left", "right"])
 LINK = hg.erasure(hg.perfect(2), 0.9)
 GOOD = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
-SURE = hg.linear_filter(hg.LinearPlant(DRIFT, [[0.01]], [0.0], [[10.0]], states=["level"]), SENSOR, hg.perfect(2))
-NETWORK = hg.Network(
-    PLANT, {"a": hg.Node(SENSOR, LINK, {"sure": SURE, "good": GOOD}), BAD: hg.Node(SENSOR, hg.perfect(2), {})}
-)
+CALM = hg.LinearPlant(DRIFT, [[0.01]], [0.0], [[10.0]], states=["level"])
+SURE = hg.linear_filter(CALM, SENSOR, hg.perfect(2))
+NODES = {"a": hg.Node(SENSOR, LINK, {"sure": SURE, "good": GOOD}), BAD: hg.Node(SENSOR, hg.perfect(2), {})}
+WORLD, NETWORK = hg.Network(PLANT, NODES), hg.Network(CALM, NODES)  # what happens, and what was thought of it
 
 
 @pytest.fixture(scope="module")
 def health():
-    record = hg.monte_carlo(NETWORK, STEPS, 1, key=1)
+    record = hg.monte_carlo(WORLD, STEPS, 1, key=1)
     received = {node: z[0].copy() for node, z in record.measurements.items()}
     received[BAD][10:14, 1] = np.nan
     return examine(NETWORK, hg.run(NETWORK, received), np.zeros((STEPS, 0)))

@@ -2,6 +2,7 @@
 
 from .base import (
     AbstractFilter as AbstractFilter,
+    believes as believes,
     corrects as corrects,
     estimates as estimates,
     in_float64 as in_float64,

@@ -18,6 +18,7 @@ from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
+from heliograph.model.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import in_float64
@@ -27,8 +28,8 @@ from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = [
-    "AbstractFilter", "AbstractSizedFilter", "Step", "corrects", "estimates", "given", "in_float64", "measured",
-    "predicts", "step_number",
+    "AbstractFilter", "AbstractSizedFilter", "Step", "believes", "corrects", "estimates", "given", "in_float64",
+    "measured", "predicts", "step_number",
 ]  # fmt: skip
 
 Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
@@ -67,12 +68,15 @@ class AbstractFilter(Module):
         states: names of the states that are estimated, n of them.
         inputs: names of the inputs that `predict` takes.
         received: length of the measurement z; 0 for a filter that uses none, and then z may have any length.
+        kept: the premise, as `believes` keeps it beside the numbers; none of a filter that does not say what it
+            believes.
     """
 
     claim: eqx.AbstractVar[Claim]
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
     received: eqx.AbstractVar[int]
+    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)
 
     if not TYPE_CHECKING:  # a type checker knows all attributes
 
@@ -180,6 +184,11 @@ class AbstractFilter(Module):
     def angles_used(self) -> FilterAngles | None:
         """Return which states and received numbers it takes for angles; None where it does not say."""
         return None
+
+    @property
+    def premise(self) -> Premise | None:
+        """Plant, sensor, channel and trigger that the claim is about; None of a filter that does not say."""
+        return self.kept.premise
 
     @property
     def of_atoms(self) -> bool:

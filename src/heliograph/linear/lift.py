@@ -10,6 +10,7 @@ from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
@@ -178,14 +179,17 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         modes = {identity: joint_modes(measurement, order=degree) for identity, measurement in distinct.items()}
         chains = [modes[id(r.measurement)] for r in routes]
         refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
-        return lifted_modes([r.plant for r in routes], chains, degree, moments, projection)
+        of_modes = lifted_modes([r.plant for r in routes], chains, degree, moments, projection)
+        return believing(of_modes, Premise(plant, sensor, channel, order=2 * degree))
     # Start of the lifted state: E Y_0 and Cov Y_0.
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
     steps, process_rounding, received_rounding = _lifted_steps(routes, degree, moments, varies)
-    return LinearSystem(steps, mean, spread, linear_rows(n, degree), process_rounding, received_rounding, start_lost)
+    rounding = process_rounding, received_rounding, start_lost
+    system = LinearSystem(steps, mean, spread, linear_rows(n, degree), *rounding)
+    return believing(system, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lifted_steps(

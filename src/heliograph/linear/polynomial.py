@@ -21,6 +21,7 @@ from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -66,7 +67,8 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
         rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
         before = after
     steps = Steps(*map(np.array, zip(*parts, strict=True)))
-    return LinearSystem(steps, mean, spread, linear_rows(total, 2, n), rounding)
+    system = LinearSystem(steps, mean, spread, linear_rows(total, 2, n), rounding)
+    return believing(system, Premise(plant, sensor, channel, order=4))
 
 
 def _homogeneous(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:

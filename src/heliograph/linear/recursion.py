@@ -8,6 +8,7 @@ import numpy as np
 from heliograph.linear.jump_system import moved
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
+from heliograph.model.premise import believing
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, instance
 from heliograph.numerics.lapack import pseudo_solve, spectral_radius
 from heliograph.numerics.linalg import PRECISE, with_rounding
@@ -117,7 +118,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
     gains = Gains(*(over_horizon(values, system.horizon) for values in zip(*parts, strict=True)))
-    return Schedule(gains, system.mean, _supported(claim, worst, when))
+    return believing(Schedule(gains, system.mean, _supported(claim, worst, when)), system.kept.premise)
 
 
 def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:

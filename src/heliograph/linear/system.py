@@ -9,6 +9,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import STRENGTH, Claim
+from heliograph.model.premise import NOTHING, Kept
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, file_path, instance, shown
 from heliograph.numerics.module import Module, readable
@@ -61,6 +62,7 @@ class LinearSystem(Module):
     rounding: Float[np.ndarray, "time N"]
     received_rounding: Float[np.ndarray, "time m"]
     start_rounding: Float[np.ndarray, "N"]
+    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)  # what it was made of
 
     def __init__(
         self,
@@ -202,6 +204,7 @@ class Schedule(Module):
     gains: Gains
     start: Float[np.ndarray, "N"]
     claim: Claim = eqx.field(static=True)
+    kept: Kept = eqx.field(static=True, default=NOTHING, init=False, repr=False, compare=False)  # what it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
         instance("gains of a schedule", gains, Gains, "Gains")

@@ -144,7 +144,7 @@ def _parts(value: object) -> Iterable[tuple[str, object]]:
     if isinstance(value, Mapping):
         return ((repr(key), entry) for key, entry in value.items())
     if is_dataclass(value):
-        named = ((field.name, getattr(value, field.name, None)) for field in fields(value))
+        named = ((field.name, getattr(value, field.name, None)) for field in fields(value) if field.repr)
     else:
         named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
     return ((name, entry) for name, entry in named if not name.startswith("_"))

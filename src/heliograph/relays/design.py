@@ -11,6 +11,7 @@ from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import given_bounds
+from heliograph.model.premise import Premise, believing
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
@@ -158,7 +159,9 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         moved = transition, gain, offset
         arrays = Gains(*moved, *moved, expected, constant, *believed)
         schedules[name] = Schedule(arrays, network.initial()[0], given_bounds("exact", network))
-    return schedules
+    relayed = {name: schedules[name].gains.gain for name in network.relays}
+    premise = Premise(network.plant, relays=network, gains=relayed)
+    return {name: believing(schedule, premise) for name, schedule in schedules.items()}
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
@@ -265,7 +268,16 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     )
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     mean[:n], covariance[:d, :d] = network.initial()[0], start_moments(network)[:d, :d]
-    return LinearSystem(system, mean, covariance, np.eye(n, d + r))
+    # Gains on what nobody transmits are not used.
+    ends, live = np.cumsum(network.received), np.asarray(steps.live)
+    relayed = {
+        name: np.asarray(gains[name]) * live[:, None, end - size : end]
+        for name, size, end in zip(network.relays, network.received, ends, strict=False)
+    }
+    return believing(
+        LinearSystem(system, mean, covariance, np.eye(n, d + r)),
+        Premise(network.plant, relays=network, gains=relayed),
+    )
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:

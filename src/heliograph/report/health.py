@@ -14,6 +14,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.erasure import outcomes
 from heliograph.report.arrivals import Arrivals, rows_are_messages
 from heliograph.report.outputs import OutputHealth, listeners, outputs_of
+from heliograph.simulation.claims import beliefs
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node, ReceivingNode
 from heliograph.simulation.results.record import Record
@@ -49,6 +50,7 @@ class Health:
     filters: list[FilterHealth]
     outputs: list[OutputHealth]  # by filter that claims a covariance
     shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
+    beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
@@ -173,7 +175,8 @@ def examine(
             test = _test_of(white)
         lost = np.any(record.estimates[node][name].claims == "none")
         filters.append(FilterHealth(node, name, "none" if lost else filter.claim, white, test, listener.trusted))
-    return Health(record, _links(network, record), filters, outputs, network.shared)
+    others = tuple(belief.words for belief in beliefs(network))
+    return Health(record, _links(network, record), filters, outputs, network.shared, others)
 
 
 def _links(network: Network, record: Record) -> list[Arrivals]:

@@ -15,7 +15,7 @@ from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.report.held import HeldValue, held_value
 from heliograph.report.medians import law_medians
 from heliograph.report.results import Json
-from heliograph.simulation.network import FUSED, Network, claim_at
+from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import correlated_mean
 
@@ -146,7 +146,7 @@ def _relied_on(network: Network) -> dict[str, set[str]]:
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
     results = {}
     for node, receiver in network.nodes.items():
-        claims = {name: STRENGTH[claim_at(receiver, filter)] for name, filter in receiver.filters.items()}
+        claims = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
         strongest = [name for name, s in claims.items() if s == max(claims.values())]
         results[node] = fused & set(claims) or set(strongest[:1])
     return results

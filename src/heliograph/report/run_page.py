@@ -121,7 +121,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
         + _agreement(health, doubts),
         sections=[
-            Section("At a glance", [KeyFigures(keys), *_warned(doubts), *_compared(health)]),
+            Section("At a glance", [KeyFigures(keys), *_warned(doubts), *_compared(health), *_believed(health)]),
             Section("Estimates", [*errors_table(record), *_pictures(health, drawings)]),
             innovations_section(health, drawings),
             Section("Links", _health(health, drawings)),
@@ -236,6 +236,12 @@ def _compared(health: Health) -> list[Text | Points]:
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
+
+
+def _believed(health: Health) -> list[Text | Points]:
+    """Return the filters that were made for another world than that of their node."""
+    text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
+    return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
 
 
 def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:

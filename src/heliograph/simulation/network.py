@@ -24,7 +24,15 @@ from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import anonymous, check_forgets, memories
 from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.centres.mesh_check import check_mesh, mesh_claim
+from heliograph.simulation.claims import (
+    fused_standing,
+    lowered_claim,
+    nodes_standing,
+    nominal_fused,
+    nominal_nodes,
+)
 from heliograph.simulation.description.diagram import short_text_of, table_of
+from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
     Common,
     Node,
@@ -35,12 +43,10 @@ from heliograph.simulation.node import (
     check_received,
     check_sizes,
     check_type,
-    lowered_claim,
 )
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
-FUSED = "fused"  # the name under which results of several nodes stand
 LOCAL = "local"  # a relay's one filter
 SENSORLESS = ReceivingNode({}, 0, (), True)  # a node that estimates from its neighbours alone
 
@@ -109,6 +115,7 @@ class Network(Module):
         if not self.nodes:
             raise fail("network", "at least one node", "none")
         self._check_nodes()
+        self.nodes = nodes_standing(self)
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = _grouped((name, (_world(n), n.filters, meshes[name])) for name, n in self.nodes.items())
@@ -122,6 +129,7 @@ class Network(Module):
         )
         self._check_links()
         self._check_fused()
+        self.fused = fused_standing(self)
         for name, mesh in self.meshes.items():
             check_mesh(name, mesh, self)
 
@@ -312,23 +320,25 @@ class Network(Module):
 
     def claims(self) -> Claims:
         """Claim of every estimate, by node and filter; fused ones last, under "fused"."""
-        claims = {
-            name: {f: claim_at(node, filter) for f, filter in node.filters.items()} for name, node in self.nodes.items()
-        }
+        claims = {name: {f: filter.claim for f, filter in node.filters.items()} for name, node in self.nodes.items()}
         for name, mesh in self.meshes.items():
-            claim = mesh_claim(name, mesh, self)
+            claim = lowered_claim(mesh_claim(name, mesh, self)) if self.single else mesh_claim(name, mesh, self)
             for node in self.mesh_nodes(name):
                 claims[node][name] = claim
         if self.fused:
-            claims[FUSED] = {name: self._fused_claim(fusion) for name, fusion in self.fused.items()}
-            if any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values()):
-                claims[FUSED] = lowered(claims)[FUSED]
-        return lowered(claims) if self.single else claims
+            by_data = any(isinstance(node, Node) and node.trigger is not None for node in self.nodes.values())
+            claims[FUSED] = {
+                name: lowered_claim(claim) if isinstance(fusion, Fusion) and (by_data or self.single) else claim
+                for name, fusion in self.fused.items()
+                for claim in (self._fused_claim(fusion),)
+            }
+        return claims
 
     def in_single_precision(self) -> "Network":
         """Return the network for single precision: the lost digits are not bounded, so that all claims are lowered."""
         lowered = copy(self)
-        object.__setattr__(lowered, "single", True)
+        for field, value in (("nodes", nominal_nodes(self)), ("fused", nominal_fused(self)), ("single", True)):
+            object.__setattr__(lowered, field, value)
         return lowered
 
     def _fused_claim(self, fusion: Fusion | AbstractFilter) -> Claim:
@@ -337,7 +347,7 @@ class Network(Module):
         names = self.nodes_with(fusion.filter)
         # A rule that needs nothing but the estimates.
         if not isinstance(fusion.rule, AbstractInformedFusion):
-            return fusion.claim([claim_at(self.nodes[n], self.nodes[n].filters[fusion.filter]) for n in names])
+            return fusion.claim([self.nodes[n].filters[fusion.filter].claim for n in names])
         rule, nodes = type(fusion.rule).__name__, {n: self.nodes[n] for n in names}
         if fusion.quantizer is not None and not fusion.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
@@ -375,16 +385,6 @@ def _world(node: Node | ReceivingNode) -> object:
     if isinstance(node, Node):
         return node.sensor, anonymous(node.channel), node.informed_by, node.trigger, node.predictor
     return node.received, node.complete
-
-
-def claim_at(node: Node | ReceivingNode, filter: AbstractFilter) -> Claim:
-    """Claim of a filter at a node."""
-    return node.claim_of(filter) if isinstance(node, Node) else filter.claim
-
-
-def lowered(claims: Claims) -> Claims:
-    """Lower every claim to "nominal" at most."""
-    return {node: {name: lowered_claim(claim) for name, claim in element.items()} for node, element in claims.items()}
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:

@@ -17,11 +17,11 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, check_sent, received_angles
 from heliograph.model.estimate import Claim
 from heliograph.model.limits import Limits, LimitsLike, limits_of
-from heliograph.model.over_time import alike, first
+from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, table
 from heliograph.numerics.module import Module, readable
@@ -30,6 +30,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import ModeOutput, OneStepLate
 
+FUSED = "fused"  # the name under which results of several nodes stand
 NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
 
@@ -95,7 +96,7 @@ class Node(Module):
             not arrived, are counted and named. Claims stand as far as no honest number is among them.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
         trigger: when the sender transmits, such as `SendOnDelta(0.5)`; at each step by default. The filter for it is
-            `event_filter`; all others take what was not sent for missing, and then claim "nominal" at most.
+            `event_filter`; all others take what was not sent for missing.
 
     Raises:
         ValueError: a sensor and a channel that do not fit; a filter with another number of values than arrive,
@@ -151,14 +152,6 @@ class Node(Module):
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
         return next(name for name, filter in self.filters.items() if _predicts(filter, self.trigger))
-
-    def claim_of(self, filter: AbstractFilter) -> Claim:
-        """Claim of a filter here: without the trigger it does not know why something is missing."""
-        if self.trigger is None or isinstance(self.trigger, Periodic) or not filter.received:
-            return filter.claim
-        rule = getattr(filter, "trigger", None)
-        knows = alike(rule, self.trigger) and bool(eqx.tree_equal(rule, self.trigger))
-        return filter.claim if knows else lowered_claim(filter.claim)
 
     @property
     def informed_by(self) -> str | None:
@@ -261,11 +254,6 @@ class HasNodes(Protocol):
 
 def _predicts(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:
     return isinstance(filter, EventFilter | StochasticEventFilter) and filter.trigger.reference == "prediction"
-
-
-def lowered_claim(claim: Claim) -> Claim:
-    """Nominal, whatever is claimed more."""
-    return "none" if claim == "none" else "nominal"
 
 
 def check_trigger(

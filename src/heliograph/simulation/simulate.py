@@ -18,7 +18,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.centres.mesh import meshes_of
 from heliograph.simulation.medium import medium_of
-from heliograph.simulation.network import Network, lowered
+from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
@@ -96,6 +96,7 @@ def monte_carlo(
     u = inputs_of(network, inputs, horizon)
     base = key_of(key)
     single = _is_single(precision, network)
+    network = network.in_single_precision() if single else network
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
@@ -107,9 +108,6 @@ def monte_carlo(
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
     job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
     recorded = _recorded(job, first_run, runs, chunk, progress)
-    if single:
-        network = network.in_single_precision()
-        smoothing = smoothing and smoothing._replace(claims=lowered(smoothing.claims))
     return _warned(finished(reducer, recorded, network, smoothing), network)
 
 

@@ -24,8 +24,8 @@ def test_a_network_prints_as_plant_nodes_from_sensor_to_filters_fusions_and_what
         "Network of 22 nodes",
         "plant              LinearPlant of position, speed",
         "n0, n1, n2 … (20)  y → Rician hop → hop 1.1, 10% lost → own (exact)",
-        "a, b               y → 'street': modes (hop or hop 0.1) → own (exact)",
-        "fused all          CovarianceIntersection of 'own' of n0, n1, n2 … (22) (upper)",
+        "a, b               y → 'street': modes (hop or hop 0.1) → own (nominal, believes another channel)",
+        "fused all          CovarianceIntersection of 'own' of n0, n1, n2 … (22) (nominal)",
         "shared             fading 'street': a, b",
     ]
     assert "<td" in network._repr_html_() and "Rician hop → hop 1.1" in network._repr_html_()

@@ -16,6 +16,7 @@ from heliograph.model.estimate import Claim, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
@@ -83,10 +84,11 @@ def event_filter(
         "loses": loses, "outputs": outputs,
     }  # fmt: skip
     # A random trigger: one Gaussian is enough.
+    premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _claim_of(plant, sensor, channel, trigger)
-        return StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received))
-    return EventFilter(
+        return believing(StochasticEventFilter(trigger=trigger, **shared, **sized(claim, start, received)), premise)
+    filter = EventFilter(
         trigger=_threshold(trigger, lost if loses else None, outputs, first(channel).outputs, steps),
         known=known,
         lost=lost,
@@ -95,6 +97,7 @@ def event_filter(
         **shared,
         **sized("nominal", start, received),
     )
+    return believing(filter, premise)
 
 
 def _described(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:

@@ -32,6 +32,7 @@ from heliograph.filters.innovation import log_density
 from heliograph.filters.robust_noise import Law, ReceivedNoise, received_noise
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, over_time
+from heliograph.model.premise import believing
 from heliograph.numerics.angle import nearest
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.float64 import in_float64
@@ -216,10 +217,11 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
         raise fail("filter to adapt", expected, type(filter).__name__)
     stored = scalar("memory of an adaptive filter", memory, TINY, 1.0)
     noise = filter.noise if isinstance(filter, RobustFilter) else _noise_of(filter)
-    return AdaptiveFilter(
+    adaptive = AdaptiveFilter(
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
         received=filter.received,
     )  # fmt: skip
+    return believing(adaptive, filter.premise)
 
 
 def _noise_of(filter: GaussianFilter) -> ReceivedNoise | OverTime:

@@ -22,6 +22,7 @@ from heliograph.filters.smoother_step.building import MomentsSmootherStep, momen
 from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
+from heliograph.model.premise import believes
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
@@ -120,6 +121,7 @@ class OpenLoop(AbstractBeliefFilter):
         return state, no_innovation()
 
 
+@believes
 def open_loop_filter(
     plant: AnyPlant,
     initial_mean: Float[ArrayLike, " n"] | None = None,

@@ -31,6 +31,7 @@ from heliograph.filters.linear.linear import LinearFilter
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.premise import believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, continued, nearest, wrapped
 from heliograph.numerics.check import fail
@@ -259,7 +260,7 @@ def factored(base: AbstractFilter) -> AbstractFilter:
     whole: SecondOrder = described.values if isinstance(described, OverTime) else described
     # A linear filter weighs them by the state's moments before data, a Gaussian one by its estimate.
     by_prior = isinstance(base, LinearFilter)
-    return FactoredFilter(
+    filter = FactoredFilter(
         plant=base.plant,
         sensor=base.sensor,
         mean_gain=OverTime(whole.mean_gain) if over else whole.mean_gain,
@@ -273,3 +274,4 @@ def factored(base: AbstractFilter) -> AbstractFilter:
         angles=() if isinstance(base, LinearFilter) else base.observed_angles,
         **sized(base.claim, base, base.received),
     )
+    return believing(filter, base.premise)

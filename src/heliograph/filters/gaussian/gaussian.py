@@ -31,6 +31,7 @@ from heliograph.model.estimate import Innovation, given_bounds
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.check import fail, instance
@@ -169,6 +170,7 @@ def _build(
     angles = received_angles(plant, sensor, channel)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     # Moments of the channel, its memory ignored.
+    premise = Premise(plant, sensor, channel)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
@@ -176,8 +178,9 @@ def _build(
     # The Kalman filter is exact: linear, no random gain, no angle.
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
-    claim = given_bounds("exact" if linear and trusted and not prior_given else "nominal", plant, sensor, channel)
-    return GaussianFilter(
+    claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
+    claim = given_bounds(claim, plant, sensor, channel)
+    filter = GaussianFilter(
         plant=plant,
         sensor=sensor,
         channel=described,
@@ -189,6 +192,7 @@ def _build(
         observed_angles=angles,
         **sized(claim, start, first(channel).outputs),
     )
+    return believing(filter, premise)
 
 
 def gaussian_filter(

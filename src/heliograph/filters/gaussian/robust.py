@@ -30,6 +30,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
@@ -246,6 +247,7 @@ def _degrees(noise: ReceivedNoise) -> Vector:
     return degrees
 
 
+@believes
 def robust_filter(
     plant: AnyPlant,
     sensor: AnySensor,

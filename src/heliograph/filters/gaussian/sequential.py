@@ -20,8 +20,10 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.belief import Belief, moments_around
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
+from heliograph.model.agreement import joined
 from heliograph.model.estimate import Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
+from heliograph.model.premise import believing
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -118,7 +120,9 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     if len(angles) != 1:
         raise fail("sequential filter", "filters of one plant, whose angles are the same states", sorted(angles))
     weakest_claim = weakest([filter.claim for filter in nodes])
-    return SequentialFilter(
+    central = SequentialFilter(
         filters=nodes,
         **sized("exact" if weakest_claim == "exact" else "nominal", nodes[0], sum(filter.received for filter in nodes)),
     )
+    premises = [filter.premise for filter in nodes if filter.premise is not None]
+    return believing(central, joined(premises) if len(premises) == len(nodes) else None)

@@ -18,6 +18,7 @@ from heliograph.filters.gaussian.correction import (
     young_correction,
     zero_mean_correction,
 )
+from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -54,6 +55,14 @@ class AbstractUpdate(Module):
         """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero."""
         raise NotImplementedError
 
+    def claim(self, uncertain: bool) -> Claim:
+        """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.
+
+        Args:
+            uncertain: whether probabilities of the channel are known up to a radius only.
+        """
+        return "nominal"
+
 
 class Polytope(AbstractUpdate):
     """Bound by Young's inequality over the exact worst case of the uncertain probabilities.
@@ -83,14 +92,21 @@ class Polytope(AbstractUpdate):
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return young_correction(prior, signal, channel, present, self.scalars)
 
+    def claim(self, uncertain: bool) -> Claim:
+        """ "upper" where the law is uncertain."""
+        return "upper" if uncertain else "exact"
+
 
 class ZeroMean(AbstractUpdate):
-    """Tighter bound under the filter's premise E[e | data] = 0, hence E[e yhat'] = 0.
+    """Tighter value under the filter's premise E[e | data] = 0, hence E[e yhat'] = 0; no bound where that is not so.
 
     Then only e_y, not all of y, is correlated with e:
 
     E[e+ e+'] <= P + beta Pxy Pyy^-1 Pyx - K M Pyx - (.)' + K Omega K',
     Omega = power(Pyy) + shift(Pyy) / beta + spread(yhat yhat').
+
+    The premise holds before the first correction alone: behind a law that is off, the estimate is biased given the data
+    from then on. So behind uncertain probabilities the claim is "nominal"; errors of four times it were found.
 
     Args:
         scalar: beta > 0; None, the default, minimises the trace over beta at each step.
@@ -111,6 +127,10 @@ class ZeroMean(AbstractUpdate):
     ) -> tuple[jax.Array, jax.Array]:
         """Minimise the trace over K, and over beta unless it is fixed."""
         return zero_mean_correction(prior, signal, channel, present, self.scalar)
+
+    def claim(self, uncertain: bool) -> Claim:
+        """ "nominal" where the law is uncertain: behind a law that is off, E[e | data] is not 0 after a correction."""
+        return "nominal" if uncertain else "exact"
 
 
 class Interval(AbstractUpdate):
@@ -147,6 +167,10 @@ class Interval(AbstractUpdate):
     ) -> tuple[jax.Array, jax.Array]:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
         return young_correction(prior, signal, channel, present, self.scalars)
+
+    def claim(self, uncertain: bool) -> Claim:
+        """ "upper" where the law is uncertain."""
+        return "upper" if uncertain else "exact"
 
 
 class HopRange(NamedTuple):

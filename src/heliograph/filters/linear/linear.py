@@ -27,6 +27,7 @@ from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -180,6 +181,7 @@ def corrected_linear(
     return state._replace(mean=after.mean, covariance=after.covariance), innovation
 
 
+@believes
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
 ) -> AbstractFilter:
@@ -200,7 +202,7 @@ def linear_filter(
         channel: from the sensor to the filter.
         update: how uncertain probabilities are bounded; `Polytope()` by default, none behind links with memory.
 
-    Claim: "exact"; "upper" where probabilities are uncertain.
+    Claim: "exact"; "upper" where probabilities are uncertain, "nominal" there by `ZeroMean`.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
@@ -235,7 +237,7 @@ def linear_filter(
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         **sized(
-            given_bounds("upper" if whole.uncertain else "exact", plant, sensor, channel),
+            given_bounds(rule.claim(whole.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
@@ -266,7 +268,7 @@ def memoryless_filter(
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
         ignoring = linear_filter(plant, sensor, channel, update)
         assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-        return replace(ignoring, claim="nominal") if matters else ignoring
+        return _nominal(ignoring) if matters else ignoring
 
     # Delays: the same filter for the system enlarged by past signals.
     late = as_maps("channel", [first(forgets)])[0].past
@@ -294,4 +296,9 @@ def as_current_filter(
     """
     ignoring = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
     assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-    return replace(ignoring, claim="nominal") if first(channel).past or memory_matters(channel) else ignoring
+    return _nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring
+
+
+def _nominal(ignoring: LinearFilter) -> LinearFilter:
+    """The filter of a link that it takes for another one."""
+    return believing(replace(ignoring, claim="nominal"), ignoring.premise)

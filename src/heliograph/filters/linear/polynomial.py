@@ -22,6 +22,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -122,7 +123,7 @@ class PolynomialFilter(AbstractSizedFilter):
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
-        self.centre = centre
+        self.centre, self.kept = centre, inner.kept
         self.states, self.inputs = inner.states, inner.inputs
         fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
         if not fitting:
@@ -238,7 +239,8 @@ def polynomial_filter(
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, claim_of(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
-    return PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
+    filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
+    return believing(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lifted(
@@ -279,7 +281,7 @@ def scheduled_polynomial_filter(
     """
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
     inner = ScheduledFilter(lmmse(system, claim_of(plant, sensor, channel, degree)), first(plant).states)
-    return PolynomialFilter(inner, degree, centre=centre)
+    return believing(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
 
 
 class MemoryState(NamedTuple):
@@ -304,6 +306,7 @@ class MemoryFilter(AbstractSizedFilter):
     def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: Centre | None = None):
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
+        self.kept = products.kept
 
     @in_float64
     def init(self) -> MemoryState:
@@ -359,7 +362,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     about = plant if centre is None else without_mean(plant)
     products = lmmse(memory_system(about, sensor, channel, linear), linear.claim)
     names = first(plant).states
-    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
+    filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
+    return believing(filter, Premise(plant, sensor, channel, order=4))
 
 
 def claim_of(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:

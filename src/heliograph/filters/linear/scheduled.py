@@ -69,7 +69,7 @@ class ScheduledFilter(AbstractSizedFilter):
         self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
         self.start, self.claim = schedule.start, schedule.claim
         self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
-        self.received = g.direct.shape[2]
+        self.received, self.kept = g.direct.shape[2], schedule.kept
 
     @compiled
     def init(self) -> ScheduleState:
@@ -153,7 +153,7 @@ class LinearSystemFilter(AbstractSizedFilter):
         self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
         self.claim, self.inputs = claim, ()
         self.states = names("state names", states, len(system.projection), "x")
-        self.received = system.steps.offset.shape[-1]
+        self.received, self.kept = system.steps.offset.shape[-1], system.kept
 
     @in_float64
     def init(self) -> Belief:

@@ -28,6 +28,7 @@ from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
@@ -275,6 +276,7 @@ def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float
     return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
 
 
+@believes
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
     """Filter on the full laws of gains and noises with finitely many values, with one Gaussian after each step.
 

@@ -18,8 +18,10 @@ from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import at, first, unstack
+from heliograph.model.fading import with_flag as flagged
+from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
@@ -189,7 +191,7 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
     # Received: z and one number per memory.
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
-    return ModeObservedFilter(
+    filter = ModeObservedFilter(
         plant=plant,
         sensor=sensor,
         channel=channel,
@@ -202,3 +204,5 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
             first(channel).outputs + len(memories(channel)),
         ),
     )
+    received = at_each_step(lambda link: flagged(link, late=late), channel) if memories(channel) else channel
+    return believing(filter, Premise(plant, sensor, received))

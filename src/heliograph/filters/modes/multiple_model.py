@@ -34,6 +34,7 @@ from heliograph.model.channel import Channel, check_link, received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, instance
@@ -266,6 +267,7 @@ def by_mode(
     }  # fmt: skip
 
 
+@believes
 def imm_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -293,6 +295,7 @@ def imm_filter(
     return MultipleModelFilter(merging=MergeByNextMode(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
+@believes
 def gpb1_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:
@@ -318,6 +321,7 @@ def gpb1_filter(
     return MultipleModelFilter(merging=MergeAll(), **by_mode(plant, sensor, channel, transform, nodes))
 
 
+@believes
 def gpb2_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform | None = None, nodes: int = NODES
 ) -> MultipleModelFilter:

@@ -25,6 +25,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.check import check_count
@@ -135,6 +136,7 @@ def _folded(key: jax.Array, z: jax.Array) -> jax.Array:
     return key
 
 
+@believes
 def particle_filter(
     plant: AnyPlant,
     sensor: AnySensor,

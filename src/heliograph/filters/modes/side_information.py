@@ -27,8 +27,10 @@ from heliograph.filters.modes.modal import (
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.fading import with_flag as flagged
+from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import Premise, believing
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, probabilities
@@ -36,6 +38,7 @@ from heliograph.numerics.lapack import pseudo_solve
 from heliograph.numerics.linalg import PRECISE, rounding, spread_of, symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.base import memories
 from heliograph.random_affine.erasure import Outcome, outcomes, second_moments
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import symmetric_product
@@ -345,7 +348,7 @@ def side_information_filter(
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
-    return SideInformationFilter(
+    filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
         channel=over_time(steps) if isinstance(channel, OverTime) else steps[0],
@@ -357,6 +360,12 @@ def side_information_filter(
             first(channel).outputs + (flags is not None),
         ),
     )
+    if flags is None:
+        return believing(filter, Premise(plant, sensor, channel))
+    if len(memories(channel)) != 1:  # flags of several chains' joint mode: no channel delivers them
+        return filter
+    received = at_each_step(lambda link: flagged(link, chances), channel)
+    return believing(filter, Premise(plant, sensor, received))
 
 
 @cached

@@ -26,6 +26,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import fail, items
@@ -177,6 +178,7 @@ def _considered(prior: jax.Array, gain: jax.Array, signal: Signal, channel: Seco
     return symmetrize(prior - used - used.T + gain @ total @ gain.T)
 
 
+@believes
 def clock_filter(
     plant: AnyPlant,
     sensor: AnySensor,

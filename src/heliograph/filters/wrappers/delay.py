@@ -24,11 +24,12 @@ from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.bias import driven_by
-from heliograph.model.channel import Channel, check_link
+from heliograph.model.channel import Channel, check_link, delayed
 from heliograph.model.enlarged import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
+from heliograph.model.premise import believes, believing
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -77,7 +78,7 @@ class PartFilter(AbstractPartFilter):
 
     def __init__(self, base: AbstractFilter, states: int):
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
-        self.inputs, self.received = base.inputs, base.received
+        self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
     def angles_used(self) -> FilterAngles | None:
         """Return those of the larger filter among its first states."""
@@ -290,7 +291,11 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
 
     Source: prediction from the last filtered time; equal to augmenting the state with past signals.
     """
-    return LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+    late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+    premise = filter.premise
+    if premise is None or not delay or premise.channel is None:
+        return believing(late, premise)
+    return believing(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
 
 
 class KnownDelayFilter(AbstractPartFilter):
@@ -323,6 +328,7 @@ class KnownDelayFilter(AbstractPartFilter):
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
+@believes
 def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
     """Build a filter for a link that may be late, where `make` builds it for links without delay."""
     start, n = first(channel), len(first(plant).states)

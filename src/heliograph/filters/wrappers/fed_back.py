@@ -25,6 +25,7 @@ from heliograph.model.estimate import Estimate, Innovation, given_bounds
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.premise import believes
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
@@ -48,7 +49,7 @@ class PredictionFilter(AbstractSizedFilter):
 
     def __init__(self, base: GaussianFilter):
         self.base, self.claim = base, base.claim
-        self.states, self.inputs, self.received = base.states, base.inputs, base.received
+        self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 
     def angles_used(self) -> FilterAngles | None:
         """Return those of the filter within."""
@@ -152,6 +153,7 @@ class FedBackFilter(AbstractSizedFilter):
         return Estimate(state.mean, state.covariance, self.claim)
 
 
+@believes
 def fed_back_filter(
     plant: AnyPlant,
     sensor: AnySensor,

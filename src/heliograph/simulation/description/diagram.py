@@ -1,6 +1,6 @@
 """Diagram of a network in lines or as a table: plant, nodes from sensor to filters, channels in words, fusions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ from heliograph.random_affine.delay import Delayed, OfLine
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes
-from heliograph.simulation.node import HasNodes, Node
+from heliograph.simulation.claims import beliefs
+from heliograph.simulation.node import FUSED, HasNodes, Node
 from heliograph.simulation.shared_fading import memory_places
 
 NAMED = 3  # of many nodes that are alike, how many are named
@@ -38,26 +39,34 @@ def diagram(network: HasNodes) -> list[Part]:
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
     parts = [Part("plant", f"{type(plant).__name__} of {', '.join(network.states)}{inputs}")]
+    claims = claims_in_words(network)
     # Nodes that are alike share a line.
     alike: dict[str, list[str]] = {}
     for name in network.names:
-        alike.setdefault(_node(network, name), []).append(name)
+        alike.setdefault(_node(network, name, claims[name]), []).append(name)
     parts += [Part(listed(names), words) for words, names in alike.items()]
     # Fused estimates, then what several nodes share.
-    claims = network.claims().get("fused", {})
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
             words = f"{type(fusion).__name__} of all measurements"
         else:
             words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {listed(network.nodes_with(fusion.filter))}"
-        parts.append(Part(f"fused {name}", f"{words} ({claims[name]})"))
+        parts.append(Part(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
     parts += [Part("shared", words) for words in shared(network)]
     return [Part(visible(line.name), visible(line.words)) for line in parts]
 
 
-def _node(network: HasNodes, name: str) -> str:
+def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
+    """Return the claim of each estimate by node and filter, with what the filter believes that is not the node's."""
+    words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
+    for belief in beliefs(network):
+        words[belief.node][belief.filter] += f", believes {belief.another}"
+    return words
+
+
+def _node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
     """Return what a node receives, through which hops, and its filters with their claims."""
-    node, claims = network.nodes[name], network.claims()[name]
+    node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
     if isinstance(node, Node):
         return ARROW.join([", ".join(node.outputs), link_in_words(node.channel), filters])

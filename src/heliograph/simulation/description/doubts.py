@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
+from heliograph.model.agreement import CHANNEL
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
@@ -17,6 +18,7 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 from heliograph.simulation.boundedness import certify_boundedness
+from heliograph.simulation.claims import Belief, beliefs
 from heliograph.simulation.description.diagram import listed, shared
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -39,7 +41,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     Args:
         network: the network.
     """
-    lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network)]
+    lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
     return sorted(lines, key=lambda doubt: not doubt.serious)
 
@@ -122,9 +124,30 @@ def _bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
         yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
+def _other_worlds(network: Network) -> Iterator[Doubt]:
+    """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
+    alike: dict[tuple[bool, str, tuple[str, ...]], list[Belief]] = {}
+    forgetful = _forgetful(network)
+    for belief in beliefs(network):
+        if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
+            continue  # said already, with what to do
+        alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
+    for (lowered, _, _), of in alike.items():
+        more = f" (and at {listed([repr(belief.node) for belief in of[1:]])})" if len(of) > 1 else ""
+        yield Doubt(lowered, f"another world: {of[0].words}{more}{', so that its claim is nominal' * lowered}")
+
+
 def _forgotten(network: Network) -> Iterator[Doubt]:
     """Yield filters that take draws as independent over time behind a link whose gains are not."""
-    # Nodes of each filter that ignores the memory of their links.
+    for label, names in _forgetful(network).items():
+        words = f"ignored memory: {label!r} of {listed(names)} takes a link for one without memory"
+        yield Doubt(
+            True, f"{words}, another channel than its own; linear_filter or mixture_filter of the link knows it"
+        )
+
+
+def _forgetful(network: Network) -> dict[str, list[str]]:
+    """Return the nodes of each filter that ignores the memory of their links."""
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():
         if not isinstance(node, Node):
@@ -136,9 +159,7 @@ def _forgotten(network: Network) -> Iterator[Doubt]:
         for label, filter_ in node.filters.items() if remembers else ():
             if _forgets(filter_):
                 nodes.setdefault(label, []).append(name)
-    for label, names in nodes.items():
-        words = f"ignored memory: {label!r} of {listed(names)} takes a link for one without memory"
-        yield Doubt(True, f"{words}; linear_filter or mixture_filter of the link itself knows it")
+    return nodes
 
 
 def _forgets(filter: AbstractFilter) -> bool:

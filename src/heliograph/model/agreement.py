@@ -1,0 +1,318 @@
+"""Whether two descriptions of the world agree, compared as values: the parts in which a filter believes another one.
+
+Laws agree that are written alike. A claim that rests on means and covariances alone holds for every law that shares
+them, so that of such filters only these are compared: E[G], E[n] and Cov(z | y) given what arrives, whatever is lost.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.model.channel import Channel, parallel
+from heliograph.model.enlarged import JointSensor, joint_sensor
+from heliograph.model.fading import memory_matters, without_memory
+from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
+from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
+from heliograph.model.premise import MEAN_AND_COVARIANCE, Premise
+from heliograph.model.same_program import same_function
+from heliograph.model.sensor import AbstractSensor, LinearSensor
+from heliograph.model.trigger import AbstractTrigger, Periodic
+from heliograph.numerics.module import same
+from heliograph.numerics.traced import is_traced
+from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.combine import GainAndNoise, Mixture, Series, Stack, known, opened
+from heliograph.random_affine.erasure import arrived, outcomes, second_moments
+from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.modes import Modes, joint_modes
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.outliers import is_bounded
+
+ROUNDING = 1e-12  # relative: moments that were computed in another order
+PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
+
+
+def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
+    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger, relays.
+
+    Args:
+        believed: what the filter was made for.
+        own: plant, sensor, channel and trigger of the place where it stands.
+    """
+    order = believed.order
+    parts = [] if _at_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
+    if own.relays is not None or believed.relays is not None:
+        agree = same(believed.relays, own.relays) and _same_gains(believed, own)
+        return (*parts, *([] if agree else [RELAYS]))
+    if believed.sensor is None or believed.channel is None:  # a filter without measurements
+        return tuple(parts)
+    if own.sensor is None or own.channel is None:
+        return (*parts, SENSOR)
+    if not _same_trigger(believed.trigger, own.trigger):
+        parts.append(TRIGGER)
+    sensors = _at_all_steps(_same_sensor, believed.sensor, own.sensor, order)
+    channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
+    if sensors and channels:
+        return tuple(parts)
+    observations = (believed.sensor, believed.channel), (own.sensor, own.channel)
+    if _at_all_steps(_same_observation, *observations, order):
+        return tuple(parts)
+    return tuple(parts + [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree])
+
+
+def joined(premises: Sequence[Premise]) -> Premise:
+    """Return the premise of a filter that receives all measurements of these, one after the other; of one plant."""
+    sensors = [premise.sensor for premise in premises if premise.sensor is not None]
+    channels = [premise.channel for premise in premises if premise.channel is not None]
+    triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    return premises[0].replaced(
+        sensor=at_each_step(lambda *parts: joint_sensor({str(i): s for i, s in enumerate(parts)}), *sensors),
+        channel=at_each_step(lambda *parts: parallel(parts), *channels),
+        trigger=triggers[0] if triggers else None,
+        order=None if any(premise.order is None for premise in premises) else MEAN_AND_COVARIANCE,
+    )
+
+
+def part_of(premise: Premise, rows: np.ndarray) -> Premise:
+    """Return the premise of what is received of these rows of the channel's outputs."""
+    chosen = known(np.eye(first(premise.channel).outputs)[rows])
+    return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
+
+
+def _at_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
+    """Test whether two models agree at each step; one that does not vary is the same at all of them."""
+    if same(a, b):
+        return True
+    if not any(isinstance(leaf, OverTime) for leaf in jax.tree.leaves((a, b), is_leaf=_is_over_time)):
+        return agree(a, b, order)
+    covered = {steps for steps in (steps_covered(a), steps_covered(b)) if steps is not None}
+    return len(covered) == 1 and all(agree(at(a, k), at(b, k), order) for k in range(covered.pop()))
+
+
+def _is_over_time(leaf: object) -> bool:
+    return isinstance(leaf, OverTime)
+
+
+def _close(a: Any, b: Any) -> bool:
+    """Test whether all entries are equal to rounding."""
+    if is_traced(a, b) or np.shape(a) != np.shape(b):
+        return a is b
+    x, y = np.asarray(a), np.asarray(b)
+    return bool(np.all(np.abs(x - y) <= ROUNDING * np.maximum(np.abs(x), np.abs(y))))
+
+
+def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
+    if same(a, b):
+        return True
+    if order != MEAN_AND_COVARIANCE or is_bounded(a) != is_bounded(b):
+        return False
+    return _close(a.mean, b.mean) and _close(a.covariance, b.covariance)
+
+
+def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
+    if same(a, b):
+        return True
+    sizes = [(len(plant.states), len(plant.inputs), plant.angles) for plant in (a, b)]
+    if sizes[0] != sizes[1] or not _close(a.initial_mean, b.initial_mean):
+        return False
+    if order != MEAN_AND_COVARIANCE and not same(a.deviation, b.deviation):
+        return False
+    return _close(a.initial_covariance, b.initial_covariance) and _same_motion(a, b) and _same_disturbance(a, b, order)
+
+
+def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
+    linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
+    if len(linear) == 2 and not any(isinstance(m, OfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
+        return _close(linear[0].matrix, linear[1].matrix) and _close(linear[0].input_matrix, linear[1].input_matrix)
+    return same_function(a.transition, b.transition, (len(a.states),), (len(a.inputs),))
+
+
+def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
+    if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
+        return _same_noise(a.noise, b.noise, order)
+    return same_function(a.noise_covariance, b.noise_covariance, (len(a.inputs),))
+
+
+def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
+    if same(a, b):
+        return True
+    if a.angles != b.angles or len(a.outputs) != len(b.outputs) or not _same_noise(a.noise, b.noise, order):
+        return False
+    if isinstance(a, JointSensor) and isinstance(b, JointSensor) and len(a.parts) == len(b.parts):
+        return all(_same_sensor(x, y, order) for x, y in zip(a.parts, b.parts, strict=True))
+    matrices = matrix_of(a), matrix_of(b)
+    if matrices[0] is not None and matrices[1] is not None:
+        return _close(*matrices)
+    return any(same_function(a.measure, b.measure, (n,)) for n in _states_of(a, b))
+
+
+def _states_of(*sensors: AbstractSensor) -> list[int]:
+    """Numbers of states that both sensors take, among the first few."""
+    return [n for n in range(1, 33) if all(_takes(sensor, n) for sensor in sensors)][:1]
+
+
+def _takes(sensor: AbstractSensor, states: int) -> bool:
+    try:
+        sensor.check_states(states)
+    except ValueError:
+        return False
+    return True
+
+
+def matrix_of(sensor: AbstractSensor) -> np.ndarray | None:
+    """Return the matrix of a linear sensor, or of linear ones one above the other; None of any other."""
+    if isinstance(sensor, LinearSensor):
+        return None if is_traced(sensor.matrix) else np.asarray(sensor.matrix)
+    parts = [matrix_of(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
+    return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
+
+
+def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
+    """Test whether a filter knows why nothing came; what is not sent by a schedule is missing whatever its value."""
+    if believed is None:
+        return own is None or isinstance(own, Periodic)
+    return same(believed, own)
+
+
+def _same_gains(believed: Premise, own: Premise) -> bool:
+    return all(name in own.gains and _close(gain, own.gains[name]) for name, gain in believed.gains.items())
+
+
+def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
+    """Test whether two channels agree, their memories told apart by where they stand; `loses`: whatever is lost."""
+    if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
+        return _same_map(anonymous(a), anonymous(b), order, loses)
+    if same(anonymous(a), anonymous(b)):
+        return True
+    if first(a).remembers or first(b).remembers:
+        return False
+    return _at_all_steps(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
+
+
+def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:
+    if same(a, b):
+        return True
+    if is_traced(a, b) or (a.outputs, a.inputs, a.past) != (b.outputs, b.inputs, b.past) or a.past:
+        return False
+    if _covers(a, b, order):
+        return True
+    if isinstance(a, Stack) and isinstance(b, Stack) and [m.outputs for m in a.maps] == [m.outputs for m in b.maps]:
+        return all(_same_map(x, y, order, loses) for x, y in zip(a.maps, b.maps, strict=True))
+    if not loses:
+        return False
+    try:
+        if order == MEAN_AND_COVARIANCE:
+            return _same_moments(a, b)
+        return (a.erases or b.erases) and same(arrived(a), arrived(b))
+    except ValueError:  # no moments, or more than can be listed
+        return False
+
+
+def _covers(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None) -> bool:
+    """Test whether a channel is written like the one that is believed, its laws within the believed radius."""
+    if same(a, b):
+        return True
+    believed, own = opened(a), opened(b)
+    if len(believed) != len(own) or len(own) > 1:
+        return len(believed) == len(own) and all(_covers(x, y, order) for x, y in zip(believed, own, strict=True))
+    match believed[0], own[0]:
+        case GainAndNoise() as x, GainAndNoise() as y:
+            return _holds(x.law, y.law) and _close(x.matrix, y.matrix) and _same_noise(x.noise, y.noise, order)
+        case Mixture() as x, Mixture() as y if _holds(x.choice, y.choice):
+            pass
+        case Modes() as x, Modes() as y if _holds_chain(x.memory, y.memory):
+            pass
+        case Stack() as x, Stack() as y:
+            pass
+        case _:
+            return False
+    return len(x.maps) == len(y.maps) and all(_covers(m, n, order) for m, n in zip(x.maps, y.maps, strict=True))
+
+
+def _holds(believed: AbstractLaw, own: AbstractLaw) -> bool:
+    """Test whether a law, with all that it may be, is one of those believed."""
+    if not isinstance(believed, Discrete) or not isinstance(own, Discrete):
+        return same(believed, own)
+    if not _close(believed.values, own.values):
+        return False
+    return _within(own.probabilities, own.radius, believed.probabilities, believed.radius)
+
+
+def _holds_chain(believed: MarkovChain, own: MarkovChain) -> bool:
+    if believed.identity != own.identity or not _close(believed.initial, own.initial):
+        return False
+    return _within(own.transition, own.radius, believed.transition, believed.radius)
+
+
+def _within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
+    if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
+        return False
+    return bool(np.all(np.abs(own - believed) + room <= np.asarray(radius) + ROUNDING))
+
+
+def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
+    """Test whether E[(G, n)] and Cov(z | y) of what arrives through b are those of a, at every step.
+
+    Bounds of laws would have to be compared as laws.
+    """
+    if is_bounded(a) != is_bounded(b):
+        return False
+    believed, own = (_given_arrivals(channel) for channel in (a, b))
+    whole = [moments for there, moments in believed if there.all()]
+    return bool(whole and own) and all(_agree(whole[0], moments, there) for there, moments in [*believed, *own])
+
+
+Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
+
+
+def _given_arrivals(channel: AbstractRandomAffine) -> list[tuple[np.ndarray, Moments]]:
+    """Return the moments of what arrives, for each set of components that may, and in each mode on which losses depend.
+
+    Raises:
+        ValueError: uncertain probabilities, gains that are correlated over time, more sets than are listed.
+    """
+    maps: Sequence[AbstractRandomAffine]
+    try:
+        whole = arrived(channel)
+    except ValueError:  # losses that depend on the mode: where all modes are alike, no memory of the gains is left
+        maps = joint_modes(channel).maps
+    else:
+        if memory_matters(whole):
+            raise ValueError("memory")
+        maps = unstack(without_memory(whole))
+    parts = [outcome for m in maps for outcome in outcomes(m) if outcome.arrived.any()]
+    if any(outcome.map.corner_count() > 1 for outcome in parts):
+        raise ValueError("uncertain probabilities")
+    return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in parts]
+
+
+def _agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
+    """Test whether moments of the components that are there are equal to rounding, each in units of its own size."""
+    rows = np.ix_(there, there)
+    power = [np.abs(np.einsum("iiaa->ia", second))[there] for _, second in (a, b)]
+    size = np.sqrt(np.maximum(*power))
+    scale = size[:, None, :, None] * size[None, :, None, :]
+    means = np.abs(a[0] - b[0])[there] <= ROUNDING * size
+    return bool(np.all(means) and np.all(np.abs(a[1][rows] - b[1][rows]) <= ROUNDING * scale))
+
+
+def _same_observation(
+    a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
+) -> bool:
+    """Test whether what is received of the state agrees, though sensors and channels are written in other ways."""
+    if order != MEAN_AND_COVARIANCE or is_traced(a, b):
+        return False
+    maps = [whole for observation in (a, b) if (whole := _of_state(*observation)) is not None]
+    if len(maps) < 2 or is_bounded(a) != is_bounded(b):
+        return False
+    return _same_map(anonymous(maps[0]), anonymous(maps[1]), order, True)
+
+
+def _of_state(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
+    """Return the map from the state to what is received, of a linear sensor without angles."""
+    matrix = matrix_of(sensor)
+    if matrix is None or sensor.angles or channel.past:
+        return None
+    return Series([GainAndNoise(Constant(1.0), matrix, sensor.noise), channel])

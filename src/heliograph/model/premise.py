@@ -1,0 +1,115 @@
+"""What a filter believes: the plant, sensor, channel and trigger that its claim is about."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from copy import copy
+from functools import wraps
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+
+from heliograph.model.channel import Channel, perfect
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.relays import RelayNetwork
+from heliograph.model.sensor import AnySensor
+from heliograph.model.trigger import AbstractTrigger
+from heliograph.numerics.module import readable
+
+MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
+
+
+@readable
+class Premise:
+    """What a filter believes of the world: its claim is about this plant, sensor, channel and trigger.
+
+    In a network the claim holds as far as they are the node's own (`heliograph.model.agreement`). The premise is kept
+    beside the filter's numbers and decides none of them: filters that differ in it alone have one structure.
+
+    Args:
+        plant: the plant.
+        sensor: its sensor; None for a filter without measurements, like the channel.
+        channel: from the sensor to the filter.
+        trigger: rule of the sender; None for one that sends at each step.
+        order: order of the moments of noises and gains on which the claim rests; None for one that rests on their laws.
+        relays: relays whose sums of hops are received, in place of sensor and channel; None by default.
+        gains: gains of these relays by name, (steps, n, received).
+    """
+
+    def __init__(
+        self,
+        plant: AnyPlant,
+        sensor: AnySensor | None = None,
+        channel: Channel | None = None,
+        trigger: AbstractTrigger | None = None,
+        order: int | None = MEAN_AND_COVARIANCE,
+        relays: RelayNetwork | None = None,
+        gains: Mapping[str, np.ndarray] | None = None,
+    ):
+        self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
+        self.relays, self.gains = relays, {} if gains is None else dict(gains)
+
+    def replaced(self, **parts: Any) -> "Premise":
+        """Return the premise with other parts, by name."""
+        other = copy(self)
+        other.__dict__.update(parts)
+        return other
+
+
+class Kept:
+    """A premise as a static field of a tree of arrays: all of them are equal, so that none decides what is compiled.
+
+    lowered: whether the claim was lowered, since the filter stands in another world.
+    """
+
+    def __init__(self, premise: Premise | None, lowered: bool = False):
+        self.premise, self.lowered = premise, lowered
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Kept)
+
+    def __hash__(self) -> int:
+        return hash(Kept)
+
+
+NOTHING = Kept(None)
+
+
+class Believing(Protocol):
+    """A filter, a schedule or a linear system, which keeps what it was made for."""
+
+    @property
+    def kept(self) -> Kept:
+        """The premise as it is kept."""
+
+
+B = TypeVar("B", bound=Believing)
+P = ParamSpec("P")
+
+
+def believing(made: B, premise: Premise | None) -> B:
+    """Return the filter, schedule or system with this premise, and the same numbers."""
+    twin = copy(made)
+    object.__setattr__(twin, "kept", Kept(premise))
+    return twin
+
+
+def believes(make: Callable[P, B]) -> Callable[P, B]:
+    """Let the filter that a function makes say what it believes: the arguments called plant, sensor, channel, trigger.
+
+    In a network a claim holds where these are the node's own. Without a channel, the sensor is received as it is.
+
+    Args:
+        make: a function that makes a filter for a plant, a sensor and a channel.
+    """
+    parts, parameters = ("plant", "sensor", "channel", "trigger"), inspect.signature(make)
+
+    @wraps(make)
+    def build(*args: P.args, **kwargs: P.kwargs) -> B:
+        given = parameters.bind(*args, **kwargs).arguments
+        premise = Premise(**{name: given[name] for name in parts if name in given})
+        if premise.sensor is not None and premise.channel is None:
+            premise.channel = perfect(len(first(premise.sensor).outputs))
+        return believing(make(*args, **kwargs), premise)
+
+    return build

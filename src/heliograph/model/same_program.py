@@ -1,0 +1,75 @@
+"""Whether two functions are the same program: equal operations, in order, on equal constants."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from heliograph.numerics.module import same
+
+ASIDE = ("name", "jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd")  # labels, and rules of derivatives beside the program
+
+
+def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[int, ...]) -> bool:
+    """Test whether two functions of arrays of these shapes are one, or the same program when JAX traces them.
+
+    Args:
+        f: one function, written with jax.numpy.
+        g: the other.
+        shapes: of the arguments.
+    """
+    if same(f, g):
+        return True
+    try:
+        with jax.enable_x64(True):
+            programs = [jax.make_jaxpr(function)(*map(np.zeros, shapes)) for function in (f, g)]
+    except Exception:  # what cannot be traced is equal to itself alone
+        return False
+    return _same_parameter(*programs)
+
+
+def _same_parameter(a: Any, b: Any) -> bool:
+    if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
+        return same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
+    if isinstance(a, core.Jaxpr) and isinstance(b, core.Jaxpr):
+        return _same_program(a, b)
+    if isinstance(a, tuple | list) and isinstance(b, tuple | list):
+        return len(a) == len(b) and all(map(_same_parameter, a, b))
+    return same(a, b)
+
+
+def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
+    if len(a.eqns) != len(b.eqns):
+        return False
+    names: tuple[dict[Any, int], dict[Any, int]] = {}, {}
+    _define(names, [*a.constvars, *a.invars], [*b.constvars, *b.invars])
+    for x, y in zip(a.eqns, b.eqns, strict=True):
+        if x.primitive is not y.primitive or x.params.keys() != y.params.keys():
+            return False
+        if not _same_atoms(names, x.invars, y.invars):
+            return False
+        if not all(_same_parameter(x.params[key], y.params[key]) for key in x.params if key not in ASIDE):
+            return False
+        _define(names, x.outvars, y.outvars)
+    return _same_atoms(names, a.outvars, b.outvars)
+
+
+def _define(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
+    for known, variables in zip(names, (a, b), strict=True):
+        known.update({variable: len(known) + i for i, variable in enumerate(variables)})
+
+
+def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> bool:
+    if len(a) != len(b):
+        return False
+    return all(_same_atom(names, x, y) for x, y in zip(a, b, strict=True))
+
+
+def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
+    if isinstance(x, core.Literal) and isinstance(y, core.Literal):
+        return same(np.asarray(x.val), np.asarray(y.val))
+    if isinstance(x, core.Literal) or isinstance(y, core.Literal):
+        return False
+    return names[0][x] == names[1][y] and x.aval == y.aval

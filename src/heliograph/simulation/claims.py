@@ -1,0 +1,162 @@
+"""What a claim is in a network: the filter's own where it believes the world of its place, else nominal at most."""
+
+from collections.abc import Iterator, Mapping
+from copy import copy
+from typing import NamedTuple
+
+import jax
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.fusion.rules import Fusion
+from heliograph.model.agreement import differences, joined, part_of
+from heliograph.model.estimate import Claim
+from heliograph.model.premise import Kept, Premise
+from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
+
+UNSAID = "something that it does not say"
+
+
+class Belief(NamedTuple):
+    """A filter of a network, its node (`FUSED` for one of all measurements), and where it believes another world.
+
+    lowered: whether it would claim more than "nominal" in the world that it believes.
+    """
+
+    node: str
+    filter: str
+    parts: tuple[str, ...]
+    lowered: bool
+
+    @property
+    def another(self) -> str:
+        """What it believes, in words: "another sensor and channel"."""
+        return UNSAID if self.parts == (UNSAID,) else f"another {' and '.join(self.parts)}"
+
+    @property
+    def words(self) -> str:
+        """The same as a sentence: "filter 'f' believes another channel than node 'a'"."""
+        where = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
+        return f"filter {self.filter!r} believes {self.another}{' at' if self.parts == (UNSAID,) else ' than'} {where}"
+
+
+def lowered_claim(claim: Claim) -> Claim:
+    """Nominal, whatever is claimed more."""
+    return "none" if claim == "none" else "nominal"
+
+
+def nominal(filter: AbstractFilter) -> AbstractFilter:
+    """Return the filter, and those inside, with a claim of "nominal" at most: all that is made of it says so."""
+
+    def is_inner(leaf: object) -> bool:
+        return leaf is not filter and isinstance(leaf, AbstractFilter)
+
+    leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
+    inner = [nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
+    twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
+    object.__setattr__(twin, "claim", lowered_claim(filter.claim))
+    object.__setattr__(twin, "kept", Kept(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
+    return twin
+
+
+def standing_in(own: Premise, filter: AbstractFilter) -> AbstractFilter:
+    """Return the filter as it stands in a world: with its claim where it believes it, else `nominal`.
+
+    Args:
+        own: plant, sensor, channel and trigger of the place where it stands.
+        filter: the filter, which keeps its claim outside of the network.
+    """
+    is_weak = lowered_claim(filter.claim) == filter.claim
+    return filter if is_weak or not parts_apart(own, filter) else nominal(filter)
+
+
+def nodes_standing(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes with their filters as they stand in them."""
+    results = dict(network.nodes)
+    for name, node in network.nodes.items():
+        if node.filters:
+            own = premise_at(network, name)
+            results[name] = _with_filters(node, {f: standing_in(own, filter) for f, filter in node.filters.items()})
+    return results
+
+
+def fused_standing(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+    """Return the fusions, with filters of all measurements as they stand in the network."""
+    if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
+        return network.fused
+    own = premise_of_all(network)
+    return {name: standing_in(own, f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+
+
+def nominal_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes with filters that claim "nominal" at most."""
+    return {
+        name: _with_filters(node, {label: nominal(filter) for label, filter in node.filters.items()})
+        for name, node in network.nodes.items()
+    }
+
+
+def nominal_fused(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+    """Return the fusions, with filters that claim "nominal" at most."""
+    return {name: nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+
+
+def _with_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
+    """Return the node with other filters of the same names; itself where they are its own."""
+    if all(filters[name] is node.filters[name] for name in filters):
+        return node
+    twin = copy(node)
+    object.__setattr__(twin, "filters", filters)
+    return twin
+
+
+def parts_apart(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
+    """Return the parts in which a filter believes another world than its own."""
+    return (UNSAID,) if filter.premise is None else differences(filter.premise, own)
+
+
+def premise_at(network: HasNodes, name: str) -> Premise:
+    """Return plant, sensor, channel and trigger of a node."""
+    node, plant = network.nodes[name], network.plant
+    if isinstance(node, Node):
+        return Premise(plant, node.sensor, node.channel, node.trigger)
+    if network.common is not None:
+        return part_of(Premise(plant, network.common.sensor, network.common.channel), network.rows()[name])
+    if network.relays is None:  # a node without a sensor
+        return Premise(plant)
+    schedules = {
+        relay: filter
+        for relay in network.relays.relays
+        if relay in network.nodes
+        for filter in network.nodes[relay].filters.values()
+    }
+    gains = {relay: f.gains.values.gain for relay, f in schedules.items() if isinstance(f, ScheduledFilter)}
+    return Premise(plant, relays=network.relays, gains=gains)
+
+
+def premise_of_all(network: HasNodes) -> Premise:
+    """Return plant, sensors and channels of all nodes together, in their order."""
+    if network.common is not None:
+        return Premise(network.plant, network.common.sensor, network.common.channel)
+    return joined([premise_at(network, name) for name in network.names if isinstance(network.nodes[name], Node)])
+
+
+def beliefs(network: HasNodes) -> Iterator[Belief]:
+    """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
+
+    Args:
+        network: the network.
+    """
+    for name in network.names:
+        if filters := network.nodes[name].filters:
+            yield from _of_place(name, premise_at(network, name), filters)
+    central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+    if central:
+        yield from _of_place(FUSED, premise_of_all(network), central)
+
+
+def _of_place(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[Belief]:
+    for label, filter in filters.items():
+        says = filter.premise is not None or filter.kept.lowered
+        if filter.claim != "none" and says and (parts := parts_apart(own, filter)):
+            yield Belief(node, label, parts, filter.kept.lowered)

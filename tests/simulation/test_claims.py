@@ -1,0 +1,163 @@
+"""Claims in a network: a filter's own where it believes the world in which it stands, else nominal at most."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.simulation.claims import beliefs
+
+PLANT = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
+SENSOR = hg.LinearSensor([[1.0]], 0.1)
+LINK = hg.hop(1.0, 0.1)
+STRONG = ("exact", "upper")
+
+
+def network_of(link, item, plant=PLANT, sensor=SENSOR, **options):
+    return hg.Network(plant, {"a": hg.Node(sensor, link, {"f": item}, **options)})
+
+
+def claim_at(link, item, **options):
+    return network_of(link, item, **options).claims()["a"]["f"]
+
+
+def gilbert(good=1.0, bad=0.2):
+    return hg.gilbert_elliott(hg.hop(good, 0.1), hg.hop(bad, 0.1), 0.1, 0.3)
+
+
+def late(delays=(0, 1), shares=(0.5, 0.5)):
+    return hg.model.delayed(LINK, hg.Discrete(list(delays), list(shares)))
+
+
+def linear(link):
+    return hg.linear_filter(PLANT, SENSOR, link)
+
+
+KALMAN = hg.kalman_filter(PLANT, SENSOR)
+OTHER = hg.LinearPlant([[0.99]], 0.1, [0.0], 1.0)
+CHANCE = hg.StochasticTrigger(1.0)
+ELSEWHERE = {
+    "a dropout that it does not know": (hg.dropout(LINK, 0.7), linear(LINK), {}, "channel"),
+    "fading": (hg.hop(hg.Rayleigh(1.0), 0.1), KALMAN, {}, "channel"),
+    "another plant": (hg.perfect(), KALMAN, {"plant": OTHER}, "plant"),
+    "another start": (hg.perfect(), KALMAN, {"plant": hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0)}, "plant"),
+    "another sensor": (hg.perfect(), KALMAN, {"sensor": hg.LinearSensor([[1.0]], 0.2)}, "sensor"),
+    "memory": (gilbert(), linear(hg.model.without_memory(gilbert())), {}, "channel"),
+    "no delay": (late(), linear(LINK), {}, "channel"),
+    "another delay": (late(), linear(late(shares=(0.9, 0.1))), {}, "channel"),
+    "a dropout instead of an erasure": (hg.erasure(LINK, 0.7), linear(hg.dropout(LINK, 0.7)), {}, "channel"),
+    "losses that come with noise": (
+        hg.gilbert_elliott(hg.erasure(LINK, 0.9), hg.erasure(hg.hop(1.0, 0.5), 0.5), 0.1, 0.3), linear(LINK), {},
+        "channel",
+    ),
+    "a sender that decides": (hg.perfect(), KALMAN, {"trigger": hg.SendOnDelta(0.5)}, "trigger"),
+    "another rule of the sender": (
+        hg.perfect(), hg.event_filter(PLANT, SENSOR, hg.perfect(), CHANCE), {"trigger": hg.StochasticTrigger(2.0)},
+        "trigger",
+    ),
+    "no sender": (hg.perfect(), hg.event_filter(PLANT, SENSOR, hg.perfect(), CHANCE), {}, "trigger"),
+    "an uncertain law": (hg.dropout(LINK, 0.7, 0.1), linear(hg.dropout(LINK, 0.7)), {}, "channel"),
+    "another law of powers": (
+        hg.hop(1.0, hg.random_affine.FiniteSupport([[-0.1], [0.9]], [0.9, 0.1])),
+        hg.polynomial_filter(PLANT, SENSOR, hg.hop(1.0, 0.09), 5), {}, "channel",
+    ),
+    "a bound of the noise": (
+        hg.perfect(), KALMAN,
+        {"sensor": hg.LinearSensor([[1.0]], hg.Contaminated.at_most(0.05, 0.1, 0.55))}, "sensor",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ELSEWHERE)
+def test_a_filter_made_for_another_world_claims_nothing_and_the_part_is_named(case):
+    link, item, options, part = ELSEWHERE[case]
+    network = network_of(link, item, **options)
+    assert item.claim in STRONG
+    assert network.claims() == {"a": {"f": "nominal"}}
+    assert [belief.words for belief in beliefs(network)] == [f"filter 'f' believes another {part} than node 'a'"]
+    assert f"f (nominal, believes another {part})" in repr(network)
+
+
+def rebuilt():
+    """The same world, written again: other objects, equal numbers."""
+    return hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+
+
+def test_a_world_that_is_built_again_is_the_same_one():
+    plant, sensor = rebuilt()
+    for make in (lambda: LINK, gilbert, late, lambda: hg.dropout(LINK, 0.7, 0.1), lambda: hg.erasure(gilbert(), 0.8)):
+        item = hg.linear_filter(*rebuilt(), make())
+        assert claim_at(make(), item, plant=plant, sensor=sensor) == item.claim
+    chance = hg.event_filter(*rebuilt(), hg.perfect(), hg.StochasticTrigger(1.0))
+    assert claim_at(hg.perfect(), chance, plant=plant, sensor=sensor, trigger=hg.StochasticTrigger(1.0)) == "exact"
+
+
+def test_what_does_not_matter_to_a_claim_may_differ():
+    """Losses that the receiver knows of, a schedule, and the shape of a law whose first two moments are believed."""
+    bursts = hg.gilbert_elliott(hg.erasure(hg.perfect(), 0.9), hg.erasure(hg.perfect(), 0.2), 0.1, 0.3)
+    atoms = hg.random_affine.FiniteSupport([[-(0.1**0.5)], [0.1**0.5]], [0.5, 0.5])
+    assert claim_at(bursts, KALMAN) == "exact"
+    assert claim_at(hg.perfect(), KALMAN, trigger=hg.Periodic(3)) == "exact"
+    assert claim_at(hg.perfect(), KALMAN, sensor=hg.LinearSensor([[1.0]], atoms)) == "exact"
+    rician = hg.random_affine.Rician(0.9, 0.2)
+    alike = hg.Discrete([rician.moment(1) - 0.1, rician.moment(1) + 0.1], [0.5, 0.5])
+    spread = rician.moment(2) - rician.moment(1) ** 2
+    two = hg.Discrete([rician.moment(1) - spread**0.5, rician.moment(1) + spread**0.5], [0.5, 0.5])
+    assert claim_at(hg.hop(rician, 0.1), linear(hg.hop(two, 0.1))) == "exact"
+    assert claim_at(hg.hop(rician, 0.1), linear(hg.hop(alike, 0.1))) == "nominal"
+
+
+def time_step(scale):
+    table = jnp.asarray([scale, 1.0])
+    return hg.LinearPlant(
+        lambda u: jnp.array([[1.0, u[0]], [0.0, 1.0]]), lambda u: u[0] * jnp.diag(table), [0, 0], np.eye(2),
+        inputs=["dt"],
+    )  # fmt: skip
+
+
+def test_functions_of_a_plant_are_compared_as_programs_with_their_constants():
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.1)
+    item = hg.kalman_filter(time_step(0.1), sensor)
+    assert claim_at(hg.perfect(), item, plant=time_step(0.1), sensor=sensor) == "exact"
+    assert claim_at(hg.perfect(), item, plant=time_step(0.2), sensor=sensor) == "nominal"
+
+
+def test_links_that_are_shared_at_nodes_and_not_in_the_filter_of_the_centre():
+    """Two bad links at the same time: 1.869 claimed by links apart, 2.650 true."""
+    plant = hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0)
+    streets = [hg.shared(gilbert(), "street") for _ in range(2)]
+    sensor = hg.LinearSensor([[1.0], [1.0]], 0.1 * np.eye(2))
+    central = {
+        "apart": hg.linear_filter(plant, sensor, hg.parallel([gilbert(), gilbert()])),
+        "together": hg.linear_filter(plant, sensor, hg.parallel(streets)),
+    }
+    nodes = {n: hg.Node(SENSOR, link, {}) for n, link in zip("ab", streets, strict=True)}
+    network = hg.Network(plant, nodes, central)
+    assert network.claims()["fused"] == {"apart": "nominal", "together": "exact"}
+    assert [b.words for b in beliefs(network)] == ["filter 'apart' believes another channel than all nodes together"]
+
+
+def test_a_filter_alone_keeps_its_claim():
+    network = network_of(hg.dropout(LINK, 0.7), item := linear(LINK))
+    assert network.claims() == {"a": {"f": "nominal"}}
+    assert item.claim == item.run(np.zeros((2, 1))).claim == "exact"
+    assert hg.Stream(item).push([0.0]).claim == "exact"
+
+
+def test_the_word_goes_wherever_the_claim_goes(tmp_path):
+    """Filtered, smoothed, lagged, fused; records, statistics, tables; streams, timelines, C; single precision."""
+    nodes = {n: hg.Node(SENSOR, hg.perfect(), {"f": KALMAN}, trigger=hg.SendOnDelta(0.5)) for n in "ab"}
+    network = hg.Network(PLANT, nodes, {"all": hg.Fusion("f", hg.CovarianceIntersection())})
+    assert {claim for by_name in network.claims().values() for claim in by_name.values()} == {"nominal"}
+    settings = {"horizon": 4, "runs": 2, "key": 0}
+    for smooth in (None, hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(1), hg.smoothing.FixedPoint(1)):
+        record = hg.monte_carlo(network, smooth=smooth, **settings)
+        kept = hg.monte_carlo(network, smooth=smooth, keep=hg.Statistics(), **settings)
+        for place in ("a", "b", "fused"):
+            for name, estimate in record.estimates[place].items():
+                assert estimate.claim == kept[place][name].claim == "nominal"
+    data = hg.run(network, {n: np.arange(3.0)[:, None] for n in "ab"}, smooth=hg.smoothing.FixedInterval())
+    assert {e.claim for of in data.estimates.values() for e in of.values()} == {"nominal"}
+    assert hg.Stream(network.nodes["a"].filters["f"]).push([0.0]).claim == "nominal"
+    hg.export_c(network.nodes["a"].filters["f"], tmp_path / "step.c")
+    assert "Claim: nominal" in (tmp_path / "step.h").read_text()
