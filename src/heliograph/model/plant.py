@@ -293,15 +293,20 @@ def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ..
 def check_turns(
     name: str, function: Callable[[jax.Array], jax.Array], center: Vector, given: Angles, angles: Angles
 ) -> None:
-    """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found."""
+    """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found.
+
+    What depends on a traced number has no value to judge: it was judged where its numbers were known.
+    """
     if not given or is_traced(center):
         return
-    with jax.enable_x64(True):
-        start = np.asarray(function(jnp.asarray(center)))
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        start = function(jnp.asarray(center))
+        if is_traced(start):
+            return
         for i in given:
-            moved = np.asarray(function(jnp.asarray(center + TURN * np.eye(len(center))[i])))
-            change = wrapped(moved - start, angles)
-            if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
+            moved = function(jnp.asarray(center + TURN * np.eye(len(center))[i]))
+            change = wrapped(np.asarray(moved - start), angles)
+            if np.any(np.abs(change) > SAME * (1 + np.abs(np.asarray(start)))):
                 raise fail(f"{name} with circular states", "one that a full turn does not change",
                            f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
 
