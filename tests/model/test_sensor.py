@@ -27,3 +27,20 @@ def test_a_linear_sensor_shows_its_shape_without_a_trace(monkeypatch):
 def test_a_function_must_measure_what_its_noise_disturbs(measure, message):
     with pytest.raises(ValueError, match=message):
         check_sensor(hg.Sensor(measure, np.eye(2)), 2)
+
+
+@pytest.mark.parametrize(("make", "thing", "got"), [
+    (lambda: hg.Sensor(lambda x, u: x[:1] * u[0], 0.1, ["y"]), "measure of a sensor", r"one of \(x, u\)"),
+    (lambda: hg.Sensor(lambda: 1.0, 0.1), "measure of a sensor", r"one of \(\)"),
+    (lambda: hg.Sensor(lambda x: x[:1], lambda u: u[0], ["y"]), "sensor noise", "a function"),
+    (lambda: hg.LinearSensor(lambda u: [[u[0]]], 0.1), "sensor matrix", "a function"),
+    (lambda: hg.LinearSensor([[1.0]], lambda u: [[u[0]]]), "sensor noise", "a function"),
+])  # fmt: skip
+def test_a_sensor_does_not_depend_on_inputs_and_says_so_when_it_is_made(make, thing, got):
+    with pytest.raises(ValueError, match=f"^{thing}: expected .*, as sensors do not depend on inputs, got {got}$"):
+        make()
+
+
+def test_what_takes_more_by_default_is_a_function_of_the_state():
+    for measure in (lambda x, place=2.0: x[:1] - place, lambda *parts: parts[0][:1], jnp.sin):
+        hg.Sensor(measure, 0.1, ["y"])

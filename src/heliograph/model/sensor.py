@@ -1,5 +1,6 @@
 """Sensors: y = h(x) + v."""
 
+import inspect
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -69,8 +70,8 @@ class Sensor(AbstractSensor):
 
     Raises:
         ValueError: names and noise that disagree about the number of outputs, a variance alone of a function that
-            returns more than one, circular outputs that are none. A network or filter refuses any other function that
-            returns another number of outputs.
+            returns more than one, a function of anything but x, circular outputs that are none. A network or filter
+            refuses any other function that returns another number of outputs.
     """
 
     function: Callable[[jax.Array], ArrayLike]
@@ -84,7 +85,8 @@ class Sensor(AbstractSensor):
         outputs: Names | None = None,
         circular: Sequence[str] = (),
     ):
-        self.function = function("measure of a sensor", measure, "x")
+        self.function = _of_state(measure)
+        _refuse_function("sensor noise", noise)
         dimension = (components(noise) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
@@ -121,6 +123,8 @@ class LinearSensor(AbstractSensor):
         outputs: Names | None = None,
         circular: Sequence[str] = (),
     ):
+        _refuse_function("sensor matrix", matrix)
+        _refuse_function("sensor noise", noise)
         self.matrix = array("sensor matrix", matrix, ("outputs", "states"))
         self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
@@ -134,6 +138,27 @@ class LinearSensor(AbstractSensor):
         """The same of the matrix, without a trace, of which each of many nodes would need its own."""
         if self.matrix.shape[-1] != states:
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
+
+
+def _of_state(measure: object) -> Callable[[jax.Array], ArrayLike]:
+    """Return a function of the state alone, refused where it needs anything else."""
+    checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
+    try:
+        signature = inspect.signature(checked)
+    except ValueError:  # of what is not Python, nothing is known before it is called
+        return checked
+    try:
+        signature.bind(None)
+    except TypeError:
+        expected = "a function of x alone, as sensors do not depend on inputs"
+        raise fail("measure of a sensor", expected, f"one of {signature}") from None
+    return checked
+
+
+def _refuse_function(name: str, value: object) -> None:
+    """Raise ValueError where a plant's matrix may be a function of inputs, and a sensor's may not."""
+    if callable(value):
+        raise fail(name, "a constant, as sensors do not depend on inputs", "a function")
 
 
 def _shape_of(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:

@@ -307,14 +307,18 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity."""
     report_covariance(name, value)
     matrix = _numbers(name, value)
-    # A scalar c stands for c I.
+    # A scalar c stands for c I where the dimension is known.
+    if matrix.ndim != 2 and (dimension is None or matrix.ndim):
+        raise fail(
+            name, "a square matrix, such as [[4, 0], [0, 1]], or [[4]] of one component", f"shape {matrix.shape}"
+        )
     if dimension is not None and matrix.ndim == 0:
         matrix = array(name, matrix, ()) * np.eye(dimension)
     matrix = array(name, matrix, (dimension, dimension))
     if matrix.shape[0] != matrix.shape[1]:
         raise fail(name, "a square matrix", f"shape {matrix.shape}")
     if is_traced(matrix):
-        return (matrix + matrix.T) / 2
+        return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
     # Symmetry and definiteness are judged of correlations, so that neither depends on units.
     unit = standard_deviations(matrix)
     skew = np.abs(matrix - matrix.T)
@@ -323,7 +327,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     smallest = np.min(np.linalg.eigvalsh(matrix / np.outer(unit, unit)), initial=np.inf)
     if smallest < -DEFINITENESS_TOLERANCE:
         raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(matrix)[0]:.3g}")
-    return (matrix + matrix.T) / 2
+    return matrix / 2 + matrix.T / 2  # the sum of two large variances may overflow
 
 
 def standard_deviations(matrix: np.ndarray) -> np.ndarray:
