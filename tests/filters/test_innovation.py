@@ -99,3 +99,19 @@ def test_what_all_components_exclude_leaves_their_weights():
     raw = np.array([0.3 * np.exp(-2.0), 0.7 * np.exp(-1.0), 0.0])
     np.testing.assert_allclose(after, raw / raw.sum(), rtol=1e-15)
     assert float(density) == pytest.approx(np.log(raw.sum()), rel=1e-15)
+
+
+@pytest.mark.parametrize("big", [1e300, 8.9e307, 1e308])
+def test_a_variance_near_the_largest_number_is_as_if_nothing_was_measured(big):
+    """log N by logarithms: two steps, each with -log(2 pi big) / 2 beside the density of what is measured."""
+    plant = hg.LinearPlant(np.eye(2), 0.1 * np.eye(2), [0.0, 0.0], np.eye(2))
+    z = np.array([[1.0, 2.0], [1.5, 2.5]])
+    result = hg.kalman_filter(plant, hg.LinearSensor(np.eye(2), np.diag([big, 0.01]))).run(z)
+    alone = hg.kalman_filter(plant, hg.LinearSensor([[0.0, 1.0]], 0.01)).run(z[:, 1:])
+    expected = alone.log_likelihood - (np.log(2 * np.pi) + np.log(big))
+    assert result.log_likelihood == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(result.means, alone.means, rtol=1e-12, atol=1e-280)
+    robust = hg.robust_filter(
+        plant, hg.LinearSensor(np.eye(2), np.diag([big, 0.01])), hg.perfect(2), hg.filters.Huber()
+    )
+    assert robust.run(z).means[-1, 1] == pytest.approx(alone.means[-1, 1], rel=0.2)  # of what Huber's weight leaves

@@ -24,6 +24,8 @@ from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
+LOG_TURN = float(np.log(2 * np.pi))
+
 
 def gaussian_innovation(
     z: "Float[Array, ' m']", expected: "Float[Array, ' m']", covariance: "Float[Array, 'm m']"
@@ -121,7 +123,7 @@ def _log_density(value: jax.Array, covariance: jax.Array, size: jax.Array, loope
         safe = jnp.where(determined, 1.0, pivot)
         scale = 1 / safe
         # Density of component j given those before it.
-        density = -(rest[j] ** 2 * scale + jnp.log(2 * np.pi * safe)) / 2
+        density = -(rest[j] ** 2 * scale + jnp.log(safe) + LOG_TURN) / 2
         agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)
         # Condition the remaining components on component j.
         column = jnp.where(determined, 0.0, left[:, j] * scale)

@@ -212,7 +212,8 @@ def _check(covariance: Array, apart: bool) -> None:
     if np.any(variance <= 0):
         expected = "noise of the sensor (or a law with outliers in the last hop) in each received number"
         raise fail("noise of a robust filter", expected, f"variance {variance.min():g}")
-    correlations = covariance / np.sqrt(np.outer(variance, variance))
+    deviation = np.sqrt(variance)  # the product of two large variances may overflow
+    correlations = covariance / np.outer(deviation, deviation)
     off = np.abs(correlations - np.eye(len(variance)))
     if apart and np.any(off > TOLERANCE):
         expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
