@@ -1,5 +1,7 @@
 """Messages decoded many at once against the same messages decoded one by one."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -64,7 +66,7 @@ SOURCES = {
 
 
 def compared(table, other):
-    assert table.notes == other.notes and table.broken == other.broken
+    assert (table.notes, table.broken, table.reasons) == (other.notes, other.broken, other.reasons)
     for node, columns in table.columns.items():
         expected = other.columns[node]
         assert [columns.time, columns.arrival, columns.sequence] == [expected.time, expected.arrival, expected.sequence]
@@ -88,15 +90,18 @@ def test_many_at_once_are_bit_for_bit_those_one_by_one(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("place", [0, 700])
-def test_the_first_that_cannot_be_read_is_named_as_one_by_one(tmp_path, monkeypatch, place):
-    """A stamp that nobody set, in a batch of others: what comes before it in the batch stays."""
+def test_one_that_cannot_be_read_is_refused_alone_as_one_by_one(tmp_path, monkeypatch, place):
+    """A stamp that nobody set, in a batch of others, which all are used."""
     some = messages(800, np.random.default_rng(1))
     unset = KINDS["std_msgs/msg/Header"](KINDS["builtin_interfaces/msg/Time"](0, 0), "")
     at = next(i for i in range(place, 800) if some[i][1] == "/imu")
+    good = bags.write(tmp_path / "good", some)
     some[at][3].header = unset
     path = bags.write(tmp_path / "bag", some)
     table = hg.files.read_messages(path, NETWORK, SOURCES)
-    assert f"message {at + 1}, logged at" in table.broken and "a time that was set" in table.broken
+    assert table.refused == 1 and not table.broken
+    assert f"message {at + 1}, logged at" in table.reasons[0] and "a time that was set" in table.reasons[0]
+    assert len(table) == len(hg.files.read_messages(good, NETWORK, SOURCES)) - 2  # its two sources
     monkeypatch.setattr(Decoder, "add", lambda decoder, batch, table: False)
     compared(table, hg.files.read_messages(path, NETWORK, SOURCES))
 
@@ -104,8 +109,11 @@ def test_the_first_that_cannot_be_read_is_named_as_one_by_one(tmp_path, monkeypa
 def test_a_list_that_is_too_short_is_one_line(tmp_path):
     path = bags.write(tmp_path / "bag", messages(300, np.random.default_rng(2)))
     sources = {"/scan": hg.files.json_field(["ranges.12", "angle_max", "range_max"], "a")}
-    with pytest.raises(ValueError, match=r"message 1, logged at .*, /scan: expected a field 'ranges.12', got no '12'"):
-        hg.files.read_messages(path, NETWORK, sources)
+    line = r"message 1, logged at .*, /scan: expected a field 'ranges.12', got no '12'"
+    with pytest.raises(ValueError, match=line):
+        hg.files.read_messages(path, NETWORK, sources, strict=True)
+    table = hg.files.read_messages(path, NETWORK, sources)
+    assert len(table) > 0 and table.refused > 0 and re.search(line, table.reasons[0])
 
 
 def test_definitions_say_what_layouts_expect():

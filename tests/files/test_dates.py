@@ -113,7 +113,7 @@ def test_other_frames_are_tables():
     ("table", "words"),
     [
         (pd.DataFrame({0: [1.0]}), "columns: expected names that are text, got 0"),
-        ({"time": ["one"]}, "column 'time', row 1: expected a date"),
+        ({"time": ["one"]}, "column 'time': expected numbers or dates, got 'one'"),
         ({"time": [0.0], "pos": [1j]}, "column 'pos': expected numbers or dates"),
         ({"time": [0.0], "pos": [object()]}, "column 'pos': expected numbers or dates"),
         (3, "expected a file, a DataFrame, or a dictionary of columns, got 3"),

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app import number, path_option
+from heliograph.cli.reading import Measured, ReadingOptions, read_measured, single
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
     from heliograph.report.fit_page import Learned
@@ -28,12 +28,13 @@ def fit(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; or a bag.")],
+    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; messages in lines of JSON; or a bag.")],
     out: Annotated[Path, path_option("Folder of fitted.json, fitted_network.py, figures and page; made if missing.")],
     starts: Annotated[int, number("From how many points to climb.")] = 6,
     seed: Annotated[int, number("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
     truth: Annotated[bool, Parameter(help="Learn from the true states (columns truth.STATE).", negative="")] = False,
+    reading: ReadingOptions | None = None,
 ) -> None:
     """Learn the numbers that your own network marks as free by hg.free, with intervals and identifiability.
 
@@ -55,7 +56,7 @@ def fit(
     check_seed("--seed", seed)
 
     def work(advance: "Advance") -> "Learned":
-        return learn(network, measurements, starts, seed, share, advance, truth)
+        return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions())
 
     learned = write_results(out, 6, work, lambda learning: results(learning, out, network))
     print(learned.fit)
@@ -73,6 +74,7 @@ def learn(
     held_out: float,
     advance: "Advance",
     truth: bool,
+    reading: ReadingOptions,
 ) -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
@@ -91,12 +93,13 @@ def learn(
     start = build()
     if decides(start):
         raise fail("network to be learned", "one without triggers (hg.fit in Python learns those)", "a node with one")
-    recording, messages = _data(measurements, network, start, advance, truth)
+    data = _data(measurements, network, start, advance, truth, reading)
+    recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
     fitted = _fitted(build, recording, cut, starts, seed, truth, advance)
-    fitted = replace(fitted, delays={} if messages is None else messages.delays())
+    fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
     # Predictions before and after the fit, then statistics of the losses.
     advance("judging on held-out rows")
     judged = changes(start, fitted.network, recording.measurements, recording.inputs, cut) if cut < rows else []
@@ -108,22 +111,22 @@ def learn(
 
 
 def _data(
-    measurements: Path, reference: str, network: "Network", advance: "Advance", truth: bool
-) -> "tuple[Recording, EventTable | None]":
-    """Read rows of a table, or events, which are rows in the order of measuring."""
-    from heliograph.cli.run import read_mapped
-    from heliograph.files.events import event_table, holds_events
+    measurements: Path, reference: str, network: "Network", advance: "Advance", truth: bool, reading: ReadingOptions
+) -> Measured:
+    """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
+    from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
-    from heliograph.files.recording import read_recording
     from heliograph.numerics.check import fail
 
-    messages = read_mapped(measurements, reference, network, load_module(reference)[1], advance)
-    if messages is None and holds_events(measurements):
-        messages = event_table(measurements, network)
-    recording = read_recording(measurements, network) if messages is None else messages.recording()
-    if truth and recording.truth is None:
+    module = load_module(reference)[1]
+    data = single(measurements, read_measured(measurements, reference, network, module, reading, advance))
+    for line in data.warnings:
+        print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
+    for line in data.summary:
+        print(visible(line))
+    if truth and data.recording.truth is None:
         raise fail(f"{measurements}", "columns of the true states, truth.STATE, for --truth", "none")
-    return recording, messages
+    return data
 
 
 def _fitted(

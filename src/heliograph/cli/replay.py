@@ -2,36 +2,46 @@
 
 import os
 import sys
+from collections.abc import Iterator
+from heapq import merge
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from heliograph.cli.app import number, path_option
+from heliograph.cli.reading import ReadingOptions, read_events
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from heliograph.live.event import Event
 
 LONGEST = 1e6  # seconds that the system sleeps at once
 
 
 def replay(
-    recording: Annotated[Path, path_option("CSV or Parquet: rows of time, inputs and measurements; or events.")],
+    recording: Annotated[Path, path_option("What `run` takes: rows of time, events, messages, or a bag.")],
     /,
     *,
     network: Annotated[str, Parameter(help="Whose recording it is: my_network.py, or my_network.py:name.")],
     speed: Annotated[float | None, Parameter(help="How many times faster than it was; at once, unless given.")] = None,
-    plant: Annotated[str, Parameter(help="Name of the plant in each message.")] = "",
+    plant: Annotated[
+        str | None, Parameter(help="Name of the plant in each message; as recorded, unless given.")
+    ] = None,
     loss: Annotated[float, Parameter(help="Probability that a message is lost.")] = 0.0,
     run: Annotated[float, Parameter(help="How many are lost in a row, on average; 1: each by itself.")] = 1.0,
     delay: Annotated[float, Parameter(help="Mean time on the way, of an exponential law: messages overtake.")] = 0.0,
     duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
     trace: Annotated[Path | None, path_option("CSV of a recorded link, one delay a message, nan if lost.")] = None,
     seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
+    strict: Annotated[bool, Parameter(help="Stop at the first message that cannot be read.", negative="")] = False,
 ) -> None:
     """Send a recording as messages, JSON lines on stdout for `heliograph serve`, at the pace of the recording."""
     from time import monotonic, sleep
 
-    from heliograph.files.network_file import load_network
     from heliograph.numerics.check import TINY, check_seed, fail, scalar
-    from heliograph.serving.brokers.replay import Link, along, lines, recorded, through
+    from heliograph.serving.brokers.replay import Link, along, lines, through
 
     # Check the options; a trace replaces the model of a link.
     if speed is not None:
@@ -39,13 +49,16 @@ def replay(
     link = Link(loss, run, delay, duplicates)
     if trace is not None and link != Link():
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
-    # Events of the recording, and those that arrive through the link.
-    events, origin = recorded(recording, load_network(network))
-    received = through(events, link, check_seed("--seed", seed)) if trace is None else along(events, trace)
+    check_seed("--seed", seed)
+    # Events of each plant of the recording, and those that arrive through the link.
+    sent = []
+    for i, (name, events, origin) in enumerate(_recorded(recording, network, strict)):
+        received = through(events, link, seed + i) if trace is None else along(events, trace)
+        sent.append(lines(received, name if plant is None else plant, origin))
     # Wait for each arrival on the clock, speeded up.
     begun, first = monotonic(), None
     try:
-        for arrival, line in lines(received, plant, origin):
+        for arrival, line in merge(*sent, key=lambda pair: pair[0]):
             first = arrival if first is None else first
             while speed is not None and (ahead := begun + (arrival - first) / speed - monotonic()) > 0:
                 sleep(min(ahead, LONGEST))
@@ -53,3 +66,24 @@ def replay(
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _recorded(path: Path, reference: str, strict: bool) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
+    """Yield the events of each plant with its name, and the date of time 0, which is that of all."""
+    from heliograph.disk.quoting import visible
+    from heliograph.files.network_file import load_module
+    from heliograph.serving.brokers.replay import recorded
+
+    network, module = load_module(reference)
+    options = ReadingOptions(strict=strict)
+    table = read_events(path, reference, network, module, options, lambda *_: None)
+    if table is None:
+        yield ("", *recorded(path, network))
+        return
+    from heliograph.cli.reading import said_of
+
+    for line in [*said_of(path, table), *table.notes]:
+        print(f"heliograph: {visible(line)}", file=sys.stderr)
+    for name in table.plants:
+        events = table.of(name)
+        yield name, list(events.in_order()), None if events.steps or events.numbers else events.date

@@ -2,24 +2,26 @@
 
 import sys
 import warnings
-from collections.abc import Mapping
 from importlib import import_module
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import quote
 
 from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app import path_option
+from heliograph.cli.reading import Measured, ReadingOptions, read_measured, single
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    import numpy as np
+
     from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
-    from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
@@ -27,43 +29,23 @@ if TYPE_CHECKING:
     Write = Callable[[Record, Path], None]
 
 
-def read_mapped(
-    measurements: Path, reference: str, network: "Network", module: Mapping[str, object], advance: "Advance"
-) -> "EventTable | None":
-    """Read the messages of a bag, or of a CSV file of which the sources name the topics; None for any other table."""
-    from heliograph.files.messages import is_mapped, read_messages
-    from heliograph.numerics.check import fail
-
-    sources = module.get("sources")
-    if not is_mapped(measurements, sources):
-        return None
-    if sources is None:
-        hint = f"heliograph inspect {measurements} --network {reference} suggests them"
-        raise fail(f"network {reference}", f"sources, for the topics of {measurements} ({hint})", "none")
-
-    def progress(done: int, total: int) -> None:
-        advance(f"reading {measurements.name}", done, total)
-
-    return read_messages(measurements, network, sources, progress)
-
-
 def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; or a bag.")],
+    measurements: Annotated[Path, path_option("CSV or Parquet: rows or events; messages in lines of JSON; or a bag.")],
     out: Annotated[Path | None, path_option("CSV, Parquet or MCAP to write: estimates with their claims.")] = None,
     report: Annotated[Path | None, path_option("Folder of figures, and a page on estimates and links.")] = None,
     smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
-    window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
-    lag: Annotated[float | None, Parameter(help="Of events: also estimates given what came so much later.")] = None,
+    lag: Annotated[float | None, Parameter(help="Of messages: also estimates given what came so much later.")] = None,
+    reading: ReadingOptions | None = None,
 ) -> None:
     """Run the filters of your own network over measured data.
 
     A file of events has the columns node, sequence, time, arrival, and the measured values: in any order, late, twice.
-    Then the estimates are those that became final; with --lag, those of a lag later go to a second file, OUT.lagged.
-    A bag (.mcap, .db3, .bag, or a folder) is events too, by the `sources` of the network's file; with --smooth or
-    --report it is rows in the order of measuring.
+    A bag (.mcap, .db3, .bag, or a folder), a log or a table of somebody else's making is events too, by the `sources`
+    of the network's file. The estimates are those of the events that a timeline uses, in the order of measuring; with
+    --lag, those of a lag later go to a second file, OUT.lagged. Of several plants each has a file, OUT.PLANT.
 
     Parameters
     ----------
@@ -71,35 +53,102 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
     from heliograph.smoothing.modes import named_smoothing
 
     # Check the options before JAX is imported.
-    later = named_smoothing(smooth)
-    events = _events_requested(measurements, out, report, later is not None, window is not None or lag is not None)
+    later, options = named_smoothing(smooth), reading or ReadingOptions()
+    _check_options(measurements, out, report, lag, options)
     with progress(4) as advance:
         advance("starting")
-        from heliograph.files.events import run_events
+        from heliograph.files.network_file import load_module
 
-        loaded, write, messages = _loaded(network, measurements, advance)
-        # Filter: events through a timeline, rows at once.
-        if out is not None and (events or (messages is not None and later is None and report is None)):
-            advance("filtering events")
-            waits = 10.0 if window is None else window
-            record, lines = run_events(measurements, loaded, out, waits, lag, messages, write)
-            doubts: list[str] = []
-        else:
-            recording, record, lines, doubts = _filtered(loaded, measurements, messages, later, advance)
-        if out is not None:
-            advance(f"writing {out}")
-            write(record, out)
+        loaded, module = load_module(network)
+        if not any(loaded.claims().values()):
+            raise fail(f"network {network}", "at least one filter to run", "none")
+        measured = read_measured(measurements, network, loaded, module, options, advance)
+        if lag is not None and measured[0].events is None:
+            raise fail("--lag", "messages or events", f"rows of time in {measurements}")
+        if report is not None:
+            single(measurements, measured)
+        # Each plant by itself.
+        done = []
+        for data in measured:
+            advance(f"filtering {len(data.recording.time)} rows")
+            record, doubts = _filtered(loaded, data.recording, later)
+            place = out and _place(out, data.plant, len(measured) > 1)
+            written = _of_rows(record, data.rows)
+            lines = [*_doubted(loaded, record), *data.summary]
+            if place is not None:
+                advance(f"writing {place}")
+                write = _writer(data.events, module)
+                write(written, place)
+                lines += _lagged(loaded, data, lag, options, place, write)
+            done.append((data, record, written, place, [*data.warnings, *record.failures(), *doubts], lines))
     # Report, then warnings and a summary.
-    if report is not None:
-        _write_report(network, loaded, record, recording, report)
-    if messages is not None:
-        lines += messages.notes
-        doubts += [messages.broken] if messages.broken else []
-    _print_lines(list(dict.fromkeys([*record.failures(), *doubts])), [*_written(record, out, report), *lines])
+    for data, record, written, place, doubts, lines in done:
+        if report is not None:
+            _write_report(network, loaded, record, data.recording, report)
+        _print_lines(list(dict.fromkeys(doubts)), [*_written(written, place, report), *lines])
+
+
+def _place(out: Path, plant: str, several: bool) -> Path:
+    """Return the file of a plant's estimates: of several, each has one of its name."""
+    return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
+
+
+def _of_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
+    """Return some of the rows of a record, and of what is smoothed, whose rows are the last ones."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from heliograph.model.estimate import Estimate
+
+    if rows is None or rows.all():
+        return record
+    estimates = {
+        node: {
+            name: Estimate(np.asarray(e.mean)[rows], np.asarray(e.covariance)[rows], e.claim)
+            for name, e in filters.items()
+        }
+        for node, filters in record.estimates.items()
+    }
+    measurements = {node: z[rows] for node, z in record.measurements.items()}
+    later = None if record.smoothed is None else _of_rows(record.smoothed, rows[-len(record.smoothed.time) :])
+    truth = None if record.truth is None else np.asarray(record.truth)[rows]
+    return replace(
+        record,
+        time=record.time[rows],
+        truth=truth,
+        measurements=measurements,
+        estimates=estimates,
+        smoothed=later,
+        reports={},
+        uplinks={},
+        weighed={},
+    )
+
+
+def _lagged(
+    network: "Network", data: "Measured", lag: float | None, options: ReadingOptions, place: Path, write: "Write"
+) -> list[str]:
+    """Write the estimates of a lag later beside the others, and say so; nothing without a lag."""
+    if lag is None or data.events is None:
+        return []
+    from heliograph.live.recorded import play
+    from heliograph.model.plant import TIME_STEP
+
+    window, ahead = options.limits
+    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
+    capacity = max(1000, len(data.events))
+    played = play(network, data.events.in_order(), window, lag, start, ahead, capacity).lagged
+    if played is None:
+        return []
+    path = place.with_suffix(f".lagged{place.suffix}")
+    write(played, path)
+    return [f"{path}: {len(played.time)} rows, each given what came {lag:g} later"]
 
 
 def _print_lines(warnings: list[str], summary: list[str]) -> None:
@@ -111,34 +160,22 @@ def _print_lines(warnings: list[str], summary: list[str]) -> None:
         print(visible(line))
 
 
-def _events_requested(measurements: Path, out: Path | None, report: Path | None, smooths: bool, waits: bool) -> bool:
-    """Decide whether the file is read as events; check first that the options fit together and files can be written."""
-    from heliograph.files.bag import is_bag
-    from heliograph.files.events import holds_events
-    from heliograph.numerics.check import fail
+def _check_options(
+    measurements: Path, out: Path | None, report: Path | None, lag: float | None, options: ReadingOptions
+) -> None:
+    """Check that the options fit together and files can be written."""
+    from heliograph.numerics.check import fail, scalar
 
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
-    events = (is_bag(measurements) and not smooths and report is None) or holds_events(measurements)
-    if events and (out is None or report is not None or smooths):
-        raise fail("--smooth and --report", f"rows of time, and --out FILE alone for events such as {measurements}",
-                   "events")  # fmt: skip
-    if not events and waits:
-        raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
+    window, _ = options.limits
+    if lag is not None:
+        scalar("lag", lag, 0)
+        if lag > window:
+            raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
+        if out is None:
+            raise fail("--lag", "a file for the estimates (--out FILE)", "none")
     _check_places(measurements, out, report)
-    return events
-
-
-def _loaded(reference: str, measurements: Path, advance: "Advance") -> "tuple[Network, Write, EventTable | None]":
-    """Load the network, the function that writes its estimates, and the events of the file's messages."""
-    from heliograph.files.network_file import load_module
-    from heliograph.numerics.check import fail
-
-    network, module = load_module(reference)
-    if not any(network.claims().values()):
-        raise fail(f"network {reference}", "at least one filter to run", "none")
-    messages = read_mapped(measurements, reference, network, module, advance)
-    return network, _writer(messages, module), messages
 
 
 def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "Write":
@@ -146,7 +183,7 @@ def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "W
     from heliograph.files.bag_output import write_bag
     from heliograph.files.recording import write_estimates
 
-    origin = None if messages is None or messages.steps else messages.date
+    origin = None if messages is None or messages.steps or messages.numbers else messages.date
 
     def write(record: "Record", path: Path) -> None:
         if path.suffix.lower() == ".mcap":
@@ -158,21 +195,13 @@ def _writer(messages: "EventTable | None", module: "Mapping[str, object]") -> "W
 
 
 def _filtered(
-    network: "Network",
-    measurements: Path,
-    messages: "EventTable | None",
-    smooth: "AbstractSmoothing | None",
-    advance: "Advance",
-) -> tuple["Recording", "Record", list[str], list[str]]:
-    """Filter rows; return them, the record, what the filters doubted in lines, and warnings."""
-    from heliograph.files.recording import read_recording
-
-    recording = read_recording(measurements, network) if messages is None else messages.recording()
-    advance(f"filtering {len(recording.time)} rows")
+    network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
+) -> tuple["Record", list[str]]:
+    """Filter rows; return the record, and what the filters doubted in lines."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         record = heliograph.run(network, *recording, smooth=smooth)
-    return recording, record, _doubted(network, record), [str(doubt.message) for doubt in doubts]
+    return record, [str(doubt.message) for doubt in doubts]
 
 
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:

@@ -15,7 +15,7 @@ class ServeOptions:
     """Options of the command, as they are typed."""
 
     window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0
-    ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0
+    ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.1
     leap: Annotated[float, Parameter(help="How much later than all before it without a second that confirms it.")] = (
         10_000.0
     )

@@ -9,6 +9,17 @@ from .event_table import (
 from .fitted import (
     load_fitted as load_fitted,
 )
+from .json_field import (
+    Count as Count,
+    Field as Field,
+    Level as Level,
+    Source as Source,
+    Stamp as Stamp,
+    Yaw as Yaw,
+    chirpstack as chirpstack,
+    json_field as json_field,
+    the_things_stack as the_things_stack,
+)
 from .messages import (
     read_messages as read_messages,
 )
@@ -20,10 +31,6 @@ from .recording import (
     read_recording as read_recording,
     write_estimates as write_estimates,
     write_recording as write_recording,
-)
-from .sources import (
-    Source as Source,
-    json_field as json_field,
 )
 from .table import (
     read_table as read_table,

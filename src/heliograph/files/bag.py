@@ -16,7 +16,6 @@ from heliograph.files.event_table import EventTable
 from heliograph.files.mcap_chunks import messages_of
 from heliograph.files.sources import Sources
 from heliograph.numerics.check import InputError, fail, shown_error
-from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -33,29 +32,41 @@ ENDING = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20,
 BLOCK = 1 << 20  # bytes copied at once
 
 
+class DamageError(InputError):
+    """A bag cannot be read beyond a place."""
+
+
 def is_bag(path: Path) -> bool:
-    """Return whether a path is that of a bag: a file that ends in .mcap, .db3 or .bag, or a folder of ROS 2."""
-    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
+    """Return whether a path is that of a bag: a file that ends in .mcap, .db3 or .bag, or a folder of these."""
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file() or bool(parts_of(path))
 
 
-def read_bag(path: Path, network: Network, table: object, progress: Progress | None = None) -> EventTable:
-    """Read the events of a network from a bag; only the topics of its sources are decoded.
+def parts_of(path: Path) -> list[Path]:
+    """Return the files of a folder of bags that has no metadata of ROS 2, in the order of their names."""
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return []
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS)
 
-    If the bag ends in the middle, or a message cannot be read, what came before stays, and `broken` of the result says
-    where it ended and why.
+
+def read_bag(
+    path: Path, sources: Sources, events: EventTable, progress: Progress | None = None, strict: bool = False
+) -> None:
+    """Append the events of a network in a bag to a table; only the topics of the sources are decoded.
+
+    A message that cannot be read is refused alone. If the bag ends in the middle, or a topic changes its type, what
+    came before stays, and `broken` of the table says where it ended and why.
 
     Args:
         path: the bag.
-        network: the network.
-        table: sources by topic.
+        sources: the sources.
+        events: the table.
         progress: called with the numbers of messages read and to be read.
+        strict: whether the first message that cannot be read is an error.
 
     Raises:
-        ValueError: no bag, sources that do not fit the network, or none whose topic is in the bag; one line.
+        ValueError: no bag, fields that are not in it, or no topic of the sources; one line.
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
-    sources = Sources(table, network)
-    events = EventTable(network, sources.step)
     with opened(path) as (reader, cut):
         events.broken = cut
         counts = Counter[str]()
@@ -67,17 +78,17 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
         if not used:
             raise fail(f"{path}", f"a topic of the sources, {_listed(sources.topics)}", f"only {_listed(counts)}")
         _check_types(path, reader, sources)
-        # Messages become events, many at once where all of them can; the first that cannot be read ends the reading.
+        # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
         try:
             for batch in batches(raw_messages(path, reader, used)):
                 if not decoder.add(batch, events):
-                    _add(path, reader, sources, batch, done, events)
+                    _add(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
                 if progress is not None:
                     progress(done, total)
-        except InputError as error:
-            if not len(events):
+        except DamageError as error:
+            if strict:
                 raise
             events.broken = f"{error}; what was read before it stays"
     # Say which topics of either side were left out.
@@ -87,7 +98,6 @@ def read_bag(path: Path, network: Network, table: object, progress: Progress | N
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
     if missing:
         events.notes.append(f"{path}: not in the bag: {_listed(missing)}")
-    return events
 
 
 @contextmanager
@@ -141,13 +151,13 @@ def raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator
             return
         except Exception as error:
             after = f"after message {count} of its topics, logged at {moment(last)}" if count else "before any message"
-            raise fail(f"{path}, {after}", "a bag without damage", _reason(error)) from None
+            raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _reason(error)))) from None
         # Of the type that its topic had before.
         connection, last = message.connection, message.logged
         kind = connection.msgtype
         if types.setdefault(connection.topic, kind) != kind:
             where = f"{path}, {connection.topic}, logged at {moment(last)}"
-            raise fail(where, f"messages of {types[connection.topic]}, as before", kind)
+            raise DamageError(str(fail(where, f"messages of {types[connection.topic]}, as before", kind)))
         yield message
         count += 1
 
@@ -174,20 +184,28 @@ def batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
 
 
 def _add(
-    path: Path, reader: "AnyReader", sources: Sources, batch: list[RawMessage], done: int, table: EventTable
+    path: Path,
+    reader: "AnyReader",
+    sources: Sources,
+    batch: list[RawMessage],
+    done: int,
+    table: EventTable,
+    strict: bool,
 ) -> None:
-    """Append the events of messages one after another, up to the first that cannot be read, which is an error."""
+    """Append the events of messages one after another; what cannot be read is refused alone."""
     for number, (connection, logged, data) in enumerate(batch, done + 1):
         topic, kind = connection.topic, connection.msgtype
         try:
             content = reader.deserialize(data, kind)
         except Exception as error:
             where = f"{path}, {topic}, logged at {moment(logged)}"
-            raise fail(where, f"a message of {kind}", _reason(error)) from None
+            table.refuse(fail(where, f"a message of {kind}", _reason(error)), strict)
+            continue
         try:
             readings = sources.read(topic, content, topic)
         except InputError as error:
-            raise InputError(f"{path}, message {number}, logged at {moment(logged)}, {error}") from None
+            table.refuse(InputError(f"{path}, message {number}, logged at {moment(logged)}, {error}"), strict)
+            continue
         for reading in readings:
             table.add(reading, logged)
 
@@ -219,12 +237,7 @@ def _check_types(path: Path, reader: "AnyReader", sources: Sources) -> None:
     # Paths that the sources need of each topic, against the fields of its type.
     for connection in reader.connections:
         fields = dict(fields_of(reader, connection.msgtype))
-        needed = [
-            path_
-            for source, _ in sources.of(connection.topic)
-            for path_ in (*source.paths, source.time, source.sequence, source.plant)
-            if path_
-        ]
+        needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
         # What is needed is a field, a message with fields, or in a list.
         if needed and not fields:
             what = f"{path}, {connection.topic}"

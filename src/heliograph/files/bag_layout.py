@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from heliograph.files.event_table import EventTable
-from heliograph.files.sources import Source, Sources
+from heliograph.files.event_table import NONE, EventTable
+from heliograph.files.json_field import Source, Yaw
+from heliograph.files.sources import SECOND, Sources
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -137,8 +138,11 @@ class Decoder:
             rows = np.concatenate([block.rows for block in parts])
             order = np.argsort(rows, kind="stable")
             logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
-            joined = (np.concatenate([getattr(block, name) for block in parts])[order] for name in Readings._fields[1:])
-            table.add_many(node, logged, *joined)
+            time, sequence, values = (
+                np.concatenate([getattr(block, name) for block in parts])[order]
+                for name in ("time", "sequence", "values")
+            )
+            table.add_many(node, logged, time, sequence, values, parts[-1].period)
         return True
 
     def _readings(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
@@ -153,10 +157,10 @@ class Decoder:
         for (topic, _), numbers in groups.items():
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
             for rows, columns in self._by_layout(batch[numbers[0]].connection, table):
-                for source, places in self._sources.of(topic):
-                    outputs = len(self._sources.names[source.node])
-                    read = _reading(np.array(numbers)[rows], columns, source, places, outputs)
-                    results[source.node].append(read)
+                for source, _, places in self._sources.of(topic):
+                    ((node, at),) = places.items()
+                    read = _reading(np.array(numbers)[rows], columns, source, at, len(self._sources.names[node]))
+                    results[node].append(read)
         return results
 
     def _by_layout(
@@ -167,7 +171,7 @@ class Decoder:
         left, index = np.arange(len(table)), 0
         while len(left):
             if index == len(known):
-                paths = {path for source, _ in self._sources.of(connection.topic) for path in _paths(source)}
+                paths = {path for source, *_ in self._sources.of(connection.topic) for path in _paths(source)}
                 known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].columns(table[left[fits]])
@@ -175,7 +179,7 @@ class Decoder:
 
 
 class Readings(NamedTuple):
-    """Readings of a node: numbers of their messages, times and counts (-1: the message has none), and values.
+    """Readings of a node: numbers of their messages, times (`NONE`), counts (-1: the message has none), and values.
 
     Shapes: rows, time and sequence (readings,), values (readings, outputs).
     """
@@ -184,35 +188,44 @@ class Readings(NamedTuple):
     time: np.ndarray
     sequence: np.ndarray
     values: np.ndarray
+    period: int
 
 
 def _paths(source: Source) -> list[str]:
     """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
-    if source.plant is not None or source.time_unit == "step":
+    if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutError
-    stamp = [] if source.time is None else [f"{source.time}.{field}" for field in STAMP]
-    return [*source.paths, *stamp, *([] if source.sequence is None else [source.sequence])]
+    stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
+    values = [part for path in source.paths for part in _parts(path)]
+    return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
+
+
+def _parts(path: str | Yaw) -> tuple[str, ...]:
+    return path.parts if isinstance(path, Yaw) else (path,)
 
 
 def _reading(
     rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, outputs: int
 ) -> Readings:
     none = np.full(len(rows), -1, dtype=np.int64)
+    time = np.full(len(rows), NONE)
     values = np.full((len(rows), outputs), np.nan)
     for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
-        value = columns[path].astype(np.float64)
+        numbers = [columns[part].astype(np.float64) for part in _parts(path)]
+        value = Yaw.of(*(np.where(np.isfinite(n), n, np.nan) for n in numbers)) if isinstance(path, Yaw) else numbers[0]
         values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
-    time = none
     if source.time is not None:
-        seconds, rest = (columns[f"{source.time}.{field}"] for field in STAMP)
-        time = seconds.astype(np.int64) * 10**9 + rest
-        if seconds.dtype.itemsize > 4 or np.any(time <= 0):
+        seconds, rest = (columns[f"{source.time.path}.{field}"] for field in STAMP)
+        time = seconds.astype(np.int64) * SECOND + rest
+        if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutError
-    sequence = none if source.sequence is None else columns[source.sequence]
+        time += round(source.time.offset * SECOND)
+    sequence = none if source.sequence is None else columns[source.sequence.path]
     if sequence.dtype.kind not in "iu" or (source.sequence is not None and np.any(sequence.astype(np.int64) < 0)):
         raise LayoutError
-    return Readings(rows, time, sequence.astype(np.int64), values)
+    period = 0 if source.sequence is None else source.sequence.period
+    return Readings(rows, time, sequence.astype(np.int64), values, period)
 
 
 def _column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:

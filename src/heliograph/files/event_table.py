@@ -1,42 +1,22 @@
 """Events of a recording in columns: a few numbers each, whatever the messages weighed that they were read from."""
 
-from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from heliograph.files.event_columns import SECOND, USED, Columns, Events, counted, judge, lost, order_within
 from heliograph.files.recording import Recording
 from heliograph.files.sources import Reading
 from heliograph.learning.losses.delays import Delays, learn_delays
-from heliograph.live.event import INPUTS, Event
+from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import fail, instance, scalar
+from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
-from heliograph.numerics.types import Float, Int
+from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 
-SECOND = 10**9  # nanoseconds
+NONE = np.iinfo(np.int64).min  # of many readings: the one that has no time
 MOST_STEPS = 10_000_000  # rows of a network that counts steps
-
-
-@dataclass
-class Columns:
-    """Events of one node: times and arrivals in nanoseconds or steps, counts, and `size` values of each."""
-
-    size: int
-    time: "array[int]" = field(default_factory=lambda: array("q"))
-    arrival: "array[int]" = field(default_factory=lambda: array("q"))
-    sequence: "array[int]" = field(default_factory=lambda: array("q"))
-    values: "array[float]" = field(default_factory=lambda: array("d"))
-
-    def arrays(self) -> tuple[Int[np.ndarray, " events"], ...]:
-        """Return times, arrivals and counts."""
-        return tuple(np.array(column, dtype=np.int64) for column in (self.time, self.arrival, self.sequence))
-
-    def matrix(self) -> Float[np.ndarray, "events size"]:
-        """Return the values, a row for each event."""
-        return np.array(self.values).reshape(len(self.time), self.size)
 
 
 @readable
@@ -46,43 +26,87 @@ class EventTable:
     Where the network counts steps, times are steps and events arrive at once; with the seconds of a `step` times are
     moments, each of the step that is nearest, counted from the first.
 
+    An event is named by its node, its time and its count; without a count those of equal time are told apart by their
+    order of arrival.
+
     Args:
         network: the network.
         step: seconds of a step of a network that counts steps; None where times are steps, or seconds.
         start: nanoseconds since 1970 of step 0; the first event's unless given.
+        numbers: whether times are numbers in the network's unit, and not dates (default False).
 
     Attributes:
-        columns: events by node, and of "inputs".
         notes: lines on what was read and what was left out.
         broken: where and why reading ended early; "" if it did not.
+        refused: number of messages that could not be read.
+        reasons: why, of the first of them.
     """
 
-    def __init__(self, network: Network, step: float | None = None, start: int | None = None):
+    def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
         instance("network", network, Network, "a Network")
-        self.network, self.steps = network, TIME_STEP not in network.inputs
+        self.network, self.steps, self.numbers = network, TIME_STEP not in network.inputs, numbers
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
         self.start = start
-        given = len(network.inputs) - (not self.steps)
-        self.columns = {INPUTS: Columns(given)}
-        self.columns |= {name: Columns(network.nodes[name].received) for name in network.names}
+        self._plants: dict[str, dict[str, Columns]] = {}
         self.notes: list[str] = []
         self.broken = ""
+        self.refused, self.reasons = 0, list[str]()
 
     def __len__(self) -> int:
-        return sum(len(columns.time) for columns in self.columns.values())
+        return sum(len(columns.time) for plant in self._plants.values() for columns in plant.values())
 
-    def add(self, reading: Reading, arrival: int) -> None:
-        """Append a reading that arrived at a moment, in nanoseconds since 1970.
+    @property
+    def plants(self) -> list[str]:
+        """Return the names of the plants, "" for a single one without a name."""
+        return list(self._plants)
 
-        Without a time it is of that moment; without a count it is counted here, or, where the time names it, is 0.
+    def of(self, plant: str) -> "EventTable":
+        """Return the events of one plant.
+
+        Args:
+            plant: its name.
+
+        Raises:
+            ValueError: no such plant.
         """
-        columns = self.columns[reading.node]
+        if plant not in self._plants:
+            raise fail("plant", f"one of {', '.join(map(repr, self._plants)) or 'none'}", repr(plant))
+        one = EventTable(self.network, None, self.start, self.numbers)
+        one.step, one._plants = self.step, {plant: self._plants[plant]}
+        one.notes, one.broken, one.refused, one.reasons = self.notes, self.broken, self.refused, self.reasons
+        return one
+
+    @property
+    def columns(self) -> dict[str, Columns]:
+        """Return the events by node, and of "inputs", of the single plant.
+
+        Raises:
+            ValueError: several plants.
+        """
+        if len(self._plants) > 1:
+            names = ", ".join(map(repr, list(self._plants)[:8]))
+            raise fail("events", f"those of one plant, as events.of({next(iter(self._plants))!r}) has", names)
+        return next(iter(self._plants.values()), {}) or self._columns("")
+
+    def _columns(self, plant: str) -> dict[str, Columns]:
+        if plant not in self._plants:
+            sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
+            sizes |= {name: self.network.nodes[name].received for name in self.network.names}
+            self._plants[plant] = {name: Columns(size, self.numbers) for name, size in sizes.items()}
+        return self._plants[plant]
+
+    def add(self, reading: Reading, arrival: float) -> None:
+        """Append a reading that arrived at a moment, in nanoseconds since 1970 or in the unit of times.
+
+        Without a time it is of that moment.
+        """
+        columns = self._columns(reading.plant)[reading.node]
         time = arrival if reading.time is None else reading.time
-        counted = len(columns.time) if reading.time is None else 0
         columns.time.append(time)
         columns.arrival.append(time if self._at_once else arrival)
-        columns.sequence.append(counted if reading.sequence is None else reading.sequence)
+        columns.sequence.append(-1 if reading.sequence is None else reading.sequence)
         columns.values.extend(reading.values.tolist())
+        columns.period = reading.period
 
     def add_many(
         self,
@@ -91,77 +115,109 @@ class EventTable:
         time: Int[np.ndarray, " events"],
         sequence: Int[np.ndarray, " events"],
         values: Float[np.ndarray, "events size"],
+        period: int,
     ) -> None:
-        """Append readings of a node as `add` does one after another; a time or count of -1 is one that is not there."""
-        columns, counted = self.columns[node], len(self.columns[node].time) + np.arange(len(time))
-        sequence = np.where(sequence >= 0, sequence, np.where(time < 0, counted, 0))
-        time = np.where(time < 0, arrival, time)
-        for column, numbers in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
-            column.frombytes(numbers.tobytes())
+        """Append readings of a node as `add` does one after another; without a time (`NONE`) or a count (-1)."""
+        columns = self._columns("")[node]
+        time = np.where(time == NONE, arrival, time)
+        for column, moments in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
+            column.frombytes(moments.tobytes())
         columns.sequence.frombytes(sequence.tobytes())
         columns.values.frombytes(values.tobytes())
+        columns.period = period
+
+    def refuse(self, error: InputError, strict: bool) -> None:
+        """Count a message that cannot be read, with the reason.
+
+        Raises:
+            ValueError: this error, where reading is strict.
+        """
+        if strict:
+            raise error
+        self.refused += 1
+        if len(self.reasons) < 3:
+            self.reasons.append(str(error))
+
+    def finish(self, source: str) -> None:
+        """End the reading of a source: leave out stamps that were not set; say what was left out.
+
+        A stamp that is more than a year before its arrival, or zero where the others are of our days, was not set;
+        where most of a node's are, they are of another clock, and arrivals say nothing.
+
+        Raises:
+            ValueError: no event, and a message that could not be read.
+        """
+        for plant in self._plants.values() if self.dated else ():
+            for name, columns in plant.items():
+                note, reason, count = columns.without_unset(f"{source}, {name}")
+                self.notes += [note] if note else []
+                self.reasons += [reason] if reason else []
+                self.refused += count
+        if not len(self) and (self.reasons or self.broken):
+            raise InputError((self.reasons or [self.broken])[0])
+        # Stamps that lost their digits look like this.
+        for name, time in ((name, c.time) for plant in self._plants.values() for name, c in plant.items()):
+            distinct = len(np.unique(np.array(time)))
+            if len(time) > 3 and 2 * distinct <= len(time) and not self.steps:
+                self.notes.append(f"{source}, {name}: {len(time)} events have {distinct} stamps")
 
     @property
     def origin(self) -> int:
-        """Nanoseconds since 1970 from which the times of the events count; 0 where these are steps.
+        """Nanoseconds since 1970 from which the times of the events count; 0 where these are steps or numbers.
 
         Raises:
             ValueError: no events.
         """
-        first = self._first()
-        return 0 if self.steps else first
+        return 0 if self.steps or self.numbers else self._first()
 
     def _first(self) -> int:
+        """Return the first moment, in the unit of the columns, or that of step 0."""
         if self.start is not None:
             return self.start
         times = [min(columns.time) for columns in self.columns.values() if columns.time]
         if not times:
             raise fail("events", "at least one", "none")
-        return min(times)
+        return int(min(times))
 
     @property
     def _at_once(self) -> bool:
-        """Return whether times are steps, which say nothing of the moment of arrival."""
-        return self.steps and self.step is None
+        """Return whether times are steps of messages, which say nothing of the moment of arrival."""
+        return self.steps and self.step is None and not self.numbers
 
-    def _arrays(self, name: str) -> tuple[Int[np.ndarray, " events"], ...]:
-        """Return times, arrivals and counts of a node, in steps or nanoseconds."""
-        time, arrival, sequence = self.columns[name].arrays()
-        if self.step is not None and len(time):
-            first, half = self._first(), self.step // 2
-            time, arrival = ((moments - first + half) // self.step for moments in (time, arrival))
-        return time, arrival, sequence
+    @property
+    def _unit(self) -> int:
+        """Return how many units of the columns one unit of time has."""
+        return 1 if self.steps or self.numbers else SECOND
+
+    @property
+    def dated(self) -> bool:
+        """Return whether times are dates."""
+        return not self._at_once and not self.numbers
 
     @property
     def date(self) -> np.datetime64:
         """Return the date from which the times of the events count."""
-        return np.datetime64(0 if self._at_once else self._first(), "ns")
+        return np.datetime64(self._first() if self.dated else 0, "ns")
 
     def in_order(self) -> Iterator[Event]:
-        """Yield the events in order of arrival, with times in seconds from the origin or in steps."""
-        origin, unit = self.origin, 1 if self.steps else SECOND
-        names = list(self.columns)
-        parts = [self._arrays(name) for name in names]
-        values = [columns.matrix() for columns in self.columns.values()]
-        node = np.repeat(np.arange(len(names)), [len(arrays[0]) for arrays in parts])
-        row = np.concatenate([np.arange(len(arrays[0])) for arrays in parts])
-        arrivals = np.concatenate([arrays[1] for arrays in parts])
+        """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
+        events, matrices, names = self._settled(), self._matrices(), [*self.network.names, INPUTS]
+        origin, unit = self.origin, self._unit
         # Exact differences of whole nanoseconds before they are floats.
-        for i in np.lexsort((row, arrivals)).tolist():
-            n, k = int(node[i]), int(row[i])
-            time, arrival, sequence = (int(column[k]) for column in parts[n])
-            yield Event(names[n], sequence, (time - origin) / unit, values[n][k], (arrival - origin) / unit)
+        for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
+            values = matrices[node][place]
+            yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
         """Return by node the seconds from measuring to logging of its events; inputs and nodes without any are absent.
 
         The events are in order of their times.
         """
-        results = {}
+        results, second = {}, 1 if self.numbers else SECOND
         for name in () if self._at_once else self.network.names:
             time, arrival, _ = self.columns[name].arrays()
             if len(time):
-                results[name] = ((arrival - time) / SECOND)[np.argsort(time, kind="stable")]
+                results[name] = ((arrival - time) / second)[np.argsort(time, kind="stable")]
         return results
 
     def delays(self, step: float | None = None) -> dict[str, Delays]:
@@ -173,62 +229,128 @@ class EventTable:
         Raises:
             ValueError: a step that is not positive.
         """
-        results = {}
+        results, second = {}, 1 if self.numbers else SECOND
         for name, late in self.lateness().items():
             apart = np.diff(np.unique(self.columns[name].arrays()[0]))
-            between = float(np.median(apart)) / SECOND if len(apart) else 1.0
+            between = float(np.median(apart)) / second if len(apart) else 1.0
+            between = 1.0 if self.numbers and self.steps else between
             size = step if step is not None else between if self.step is None else self.step / SECOND
             if np.any(late > -size / 2):
                 results[name] = learn_delays(late, size)
         return results
 
-    def recording(self) -> Recording:
-        """Return the events as rows in order of their times, as if none had been late; a repeated event counts once.
+    def judge(
+        self, window: float = np.inf, ahead: float = AHEAD
+    ) -> tuple["dict[str, dict[Verdict, int]]", dict[str, int]]:
+        """Count the verdicts of a timeline on the events by node, and the gaps in the nodes' counts.
+
+        Args:
+            window: how late an event may be, in seconds or steps (default any).
+            ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
+        """
+        events, verdicts = self._judged(window, ahead)
+        names = [*self.network.names, INPUTS]
+        counts = {names[node]: found for node, found in counted(events.node, verdicts).items()}
+        gaps = {}
+        for node, name in enumerate(self.network.names):
+            columns, mine = self.columns[name], events.of(events.node == node)
+            if len(columns.time) and min(columns.sequence) >= 0:
+                gaps[name] = lost(mine.time, mine.sequence, columns.period)
+        return counts, gaps
+
+    def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:
+        """Return the events that a timeline uses as rows in order of their times; a repeated event counts once.
 
         Where time counts steps, and where nodes share a channel, all events of a time are one row, else each is. An
         input holds from its event to the next, so a row has the inputs that were there after the row before; where time
         counts steps it leads to its own step. Before the first event an input is 0.
+
+        Args:
+            window: how late an event may be, in seconds or steps (default any).
+            ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
+
+        Raises:
+            ValueError: no events, several plants, steps beyond ten million.
         """
-        origin, network = self.origin, self.network
-        names, key = [INPUTS, *network.names], self._keys()
-        # Rows: one for each time, or for each event; in steps also those of which nothing arrived.
-        new = np.ones(key.shape[1], dtype=bool)
-        new[1:] = key[0, 1:] != key[0, :-1] if self.steps or network.common is not None else True
-        row, times = np.cumsum(new) - 1, key[0, new]
+        return self.rows(window, ahead)[0]
+
+    def rows(self, window: float = np.inf, ahead: float = AHEAD) -> tuple[Recording, Bool[np.ndarray, " rows"]]:
+        """Return the recording, and whether each of its rows is of a message of a node: the others are of inputs.
+
+        Args:
+            window: how late an event may be, in seconds or steps (default any).
+            ahead: how much later than its arrival the time of an event may be (default a tenth of a second).
+
+        Raises:
+            ValueError: what `recording` refuses.
+        """
+        events, verdicts = self._judged(window, ahead)
+        events = events.of(verdicts == USED)
+        if not len(events.time):
+            raise fail("events", "at least one that is used", "none")
+        # Rows in order: inputs first at each time.
+        events = events.of(np.lexsort((events.sequence, events.node, events.time)))
+        new = np.ones(len(events.time), dtype=bool)
+        new[1:] = events.time[1:] != events.time[:-1] if self._joint else True
+        row, times = np.cumsum(new) - 1, events.time[new]
         if self.steps:
-            if key[0, -1] >= MOST_STEPS:
-                raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(key[0, -1]))
-            row, times = key[0], np.arange(int(key[0, -1]) + 1)
-        # Values of each node; what came first at a time stays, and later events of the time fill what it had not.
+            if times[-1] >= MOST_STEPS:
+                raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(times[-1]))
+            row, times = events.time.astype(np.int64), np.arange(int(times[-1]) + 1)
+        # Values of each node in its row.
         tables = []
-        for node, name in enumerate(names):
-            events = key[1] == node
-            table = np.full((len(times), self.columns[name].size), np.nan)
-            values, rows = self.columns[name].matrix()[key[3, events]], row[events]
+        for n, matrix in zip((*range(len(self.network.names)), -1), self._matrices(), strict=True):
+            mine, table = events.node == n, np.full((len(times), matrix.shape[1]), np.nan)
             for i in range(table.shape[1]):
-                there = np.flatnonzero(~np.isnan(values[:, i]))[::-1]
-                table[rows[there], i] = values[there, i]
+                values = matrix[events.place[mine], i]
+                there = ~np.isnan(values)
+                table[row[mine][there], i] = values[there]
             tables.append(table)
-        inputs = self._inputs(_held(tables[0]), times)
-        time = times.astype(np.float64) if self.steps else (times - origin) / SECOND
-        return Recording(dict(zip(network.names, tables[1:], strict=True)), inputs, time)
+        inputs = self._inputs(_held(tables.pop()), times)
+        origin = self.origin
+        time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
+        measured = np.zeros(len(times), dtype=bool)
+        measured[row[events.node >= 0]] = True
+        return Recording(dict(zip(self.network.names, tables, strict=True)), inputs, time), measured
 
-    def _keys(self) -> Int[np.ndarray, "4 events"]:
-        """Return time, node, count and place of each event in the order of a timeline: inputs first at each time.
+    @property
+    def _joint(self) -> bool:
+        """Return whether all events of one time are one row."""
+        return self.steps or self.network.common is not None
 
-        Of events of the same time, node and count the first stays.
-        """
+    def _matrices(self) -> list[np.ndarray]:
+        """Return the values of each node, and last those of the inputs, whose number is -1."""
+        return [self.columns[name].matrix() for name in (*self.network.names, INPUTS)]
+
+    def _settled(self) -> Events:
+        """Return the events in order of arrival; those without a count are told apart by their order at a time."""
         parts = []
-        for node, name in enumerate([INPUTS, *self.network.names]):
-            time, _, sequence = self._arrays(name)
-            parts.append(np.stack([time, np.full(len(time), node), sequence, np.arange(len(time))]))
-        key = np.concatenate(parts, axis=1)
-        key = key[:, np.lexsort(key[::-1])]
-        first = np.ones(key.shape[1], dtype=bool)
-        first[1:] = np.any(key[:3, 1:] != key[:3, :-1], axis=0)
-        return key[:, first]
+        for node, name in enumerate((INPUTS, *self.network.names), -1):
+            time, arrival, sequence = self.columns[name].arrays()
+            parts.append(Events(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
+        events = Events(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        if not len(events.time):
+            raise fail("events", "at least one", "none")
+        events = events.of(np.lexsort((events.place, events.arrival)))
+        uncounted = events.sequence < 0
+        events.sequence[uncounted] = order_within(events.node[uncounted], events.time[uncounted])
+        # Moments to the nearest step from the first.
+        if self.step is None:
+            return events
+        first, half = self._first(), self.step // 2
+        time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
+        return events._replace(time=time, arrival=arrival)
 
-    def _inputs(self, held: Float[np.ndarray, "rows given"], times: Int[np.ndarray, " rows"]) -> np.ndarray:
+    def _judged(self, window: float, ahead: float) -> tuple[Events, Int[np.ndarray, " events"]]:
+        events, matrices = self._settled(), self._matrices()
+
+        def values(i: int) -> np.ndarray:
+            return np.asarray(matrices[events.node[i]][events.place[i]])
+
+        limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
+        return events, judge(events, values, self._joint, *limits)
+
+    def _inputs(self, held: Float[np.ndarray, "rows given"], times: np.ndarray) -> np.ndarray:
         """Return the plant's inputs of each row, from those that are held after it, and the time since the row before.
 
         Shapes: (rows, inputs).
@@ -236,11 +358,12 @@ class EventTable:
         if self.steps:
             return held
         before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
-        return np.insert(before, self.network.inputs.index(TIME_STEP), np.diff(times, prepend=times[:1]) / SECOND, 1)
+        since = np.diff(times, prepend=times[:1]) / self._unit
+        return np.insert(before, self.network.inputs.index(TIME_STEP), since, 1)
 
 
 def _held(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:
     """Fill what is missing with the value before it, 0 before the first."""
     rows = np.where(np.isnan(values), -1, np.arange(len(values))[:, None])
     last = np.maximum.accumulate(rows, axis=0) if len(values) else rows
-    return np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0))
+    return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))

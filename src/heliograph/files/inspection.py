@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.bag import OFTEN, Progress, fields_of, opened
+from heliograph.files.fields import nanoseconds
 from heliograph.files.mcap_chunks import messages_of
-from heliograph.files.sources import nanoseconds
 from heliograph.numerics.check import InputError, fail, shown_error
 from heliograph.numerics.dates import looks_like_date
 

@@ -1,35 +1,55 @@
-"""Messages of a recording, a bag or a CSV file of someone else's making, to events by the sources of a network."""
+"""Messages of a recording, a bag or a file of someone else's making, to events by the sources of a network."""
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from heliograph.files.bag import Progress, is_bag, read_bag
+from heliograph.files.bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
-from heliograph.files.sources import Sources, nanoseconds
-from heliograph.files.table import csv_header, csv_lines
-from heliograph.numerics.check import InputError, fail, file_path, instance, shown
+from heliograph.files.fields import nanoseconds
+from heliograph.files.message_files import (
+    FileMessage,
+    is_message_file,
+    message_name,
+    messages_of,
+    payload_of,
+    table_has_topics,
+)
+from heliograph.files.own_messages import OwnMessages, holds_events, is_own
+from heliograph.files.sources import Sources
+from heliograph.files.table import kind_of
+from heliograph.numerics.check import InputError, fail, file_path, instance
 from heliograph.simulation.network import Network
 
-TOPIC, PAYLOAD, ARRIVAL = "topic", "payload", "arrival"  # columns of a log of messages
 
+def read_messages(
+    path: str | Path,
+    network: Network,
+    sources: object = None,
+    progress: Progress | None = None,
+    strict: bool = False,
+    ignore_unknown: bool = False,
+) -> EventTable:
+    """Read the events of a network from a bag, or from a file of messages.
 
-def read_messages(path: str | Path, network: Network, sources: object, progress: Progress | None = None) -> EventTable:
-    """Read the events of a network from a bag, or from a CSV file that is mapped by sources.
+    A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2 or of such files; each event has the
+    time of its source and the time when it was logged. A file of messages is CSV or Parquet, of which each row is a
+    message and its columns are the fields; Influx's annotated CSV; or lines of JSON (.jsonl, .ndjson, .json, .log,
+    .txt), also those that MQTT clients print; CSV and lines may be packed (.gz). A message has the topic in its field
+    `topic`, with JSON in `payload` if there is such a field, else that named as the file. It arrives at the time in
+    `arrival` or `tst`, else at its own. Messages in our own form, with node, sequence, time and values, need no
+    sources.
 
-    A bag is a file of MCAP, SQLite (.db3) or ROS 1 (.bag), or a folder of ROS 2; each event has the time of its
-    source and the time when it was logged. In a CSV file each row is a message and its columns are the fields: of the
-    topic in a column `topic` (whose `payload` is JSON, if there is such a column), else of the topic named as the file.
-    It arrives at the time in a column `arrival`, else at its own time.
-
-    A message that cannot be read ends the reading: what came before stays, and `broken` of the result says where.
+    A message that cannot be read is refused alone: `refused` of the result counts them, `reasons` has the first.
+    Where a bag is damaged what came before stays, and `broken` says where.
 
     Args:
         path: the bag or the file.
         network: the network.
-        sources: sources by topic, as `json_field` makes them.
+        sources: sources by topic, as `json_field` makes them; None for messages in our own form.
         progress: called with the numbers of messages read and to be read (default none).
+        strict: whether the first message that cannot be read is an error (default False).
+        ignore_unknown: whether columns that the network does not know are left out, of messages in our own form
+            (default False: they are refused, since they may be misspelt).
 
     Raises:
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
@@ -37,69 +57,97 @@ def read_messages(path: str | Path, network: Network, sources: object, progress:
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
+    known = None if sources is None else Sources(sources, network)
     if is_bag(path):
-        return read_bag(path, network, sources, progress)
-    return _read_csv(path, network, Sources(sources, network))
-
-
-def is_mapped(path: Path, sources: object) -> bool:
-    """Return whether a recording is read by sources: a bag, or a CSV file with a topic for its rows."""
-    if is_bag(path):
-        return True
-    if path.suffix.lower() != ".csv" or not isinstance(sources, Mapping) or not path.is_file():
-        return False
-    return path.name in sources or TOPIC in csv_header(path)
-
-
-def _read_csv(path: Path, network: Network, sources: Sources) -> EventTable:
-    events = EventTable(network, sources.step)
-    try:
-        for number, row in _rows(path):
-            where = f"{path}, row {number}"
-            topic = str(row.get(TOPIC, path.name))
-            message = _payload(row[PAYLOAD], where) if PAYLOAD in row else row
-            # A row without a time of arrival arrives as it is measured.
-            logged = nanoseconds(row[ARRIVAL], "s", f"{where}, column {ARRIVAL!r}") if row.get(ARRIVAL) else None
-            for reading in sources.read(topic, message, where):
-                arrival = reading.time if logged is None else logged
-                if arrival is None:
-                    raise fail(f"{where}, {topic}", f"a time field (time=...), or a column {ARRIVAL!r}", "neither")
-                events.add(reading, arrival)
-    except InputError as error:
-        if not len(events):
-            raise
-        events.broken = f"{error}; what was read before it stays"
-    if sources.unknown.total():
-        counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
-        events.notes.append(f"{path}: not among the sources: {counts}")
+        if known is None:
+            raise fail("sources", f"a source for the topics of {path}", "none")
+        events = EventTable(network, known.step)
+        for part in parts_of(path) or [path]:
+            read_bag(part, known, events, progress, strict)
+    elif holds_events(path):
+        events = _own(path, network, strict, ignore_unknown)
+    else:
+        events = _mapped(path, network, known, strict)
+    if known is not None:
+        _conclude(path, known, events)
+    events.finish(str(path))
     return events
 
 
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the rows from 1, with numbers as numbers and empty cells as None."""
-    with csv_lines(path) as lines:
-        header = [name.strip() for name in next(lines, [])]
-        for number, line in enumerate(lines, 1):
-            if len(line) != len(header):
-                raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
-            cells = [(name, cell.strip()) for name, cell in zip(header, line, strict=True)]
-            yield number, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
+def is_mapped(path: Path, sources: object) -> bool:
+    """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic."""
+    if is_bag(path) or holds_events(path) or is_message_file(path):
+        return True
+    if kind_of(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
+        return False
+    return message_name(path) in sources or path.name in sources or table_has_topics(path)
 
 
-def _cell(cell: str) -> float | int | str | None:
-    """Convert a cell to a number where it is one; whole numbers keep every digit."""
-    if not cell:
-        return None
-    for kind in (int, float) if "_" not in cell else ():
-        try:
-            return kind(cell)
-        except ValueError:
+def _own(path: Path, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
+    """Read a table of events in our own form."""
+    own = OwnMessages(network, path, ignore_unknown)
+    for message in messages_of(path):
+        own.add(message, strict)
+    return own.events()
+
+
+def _mapped(path: Path, network: Network, sources: Sources | None, strict: bool) -> EventTable:
+    """Read messages by their topics, and those in our own form among them."""
+    events = None if sources is None else EventTable(network, sources.step)
+    own = OwnMessages(network, path, False)
+    for message in messages_of(path):
+        if isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
+            own.add(message, strict)
             continue
-    return cell
+        if events is None or sources is None:
+            raise fail(message.where, "a message in our own form, or sources for its topic", message.topic or "none")
+        _read(path, message, sources, events, strict)
+    if events is None or own.used:
+        if events is not None and len(events):
+            raise fail(str(path), "messages in our own form, or of topics", "both")
+        events = own.events()
+    events.refused += own.refused if own.used == 0 else 0
+    events.reasons += own.reasons if own.used == 0 else []
+    return events
 
 
-def _payload(text: str, where: str) -> object:
+def _read(path: Path, message: FileMessage, sources: Sources, events: EventTable, strict: bool) -> None:
+    """Append what a message says; what cannot be read is refused alone."""
+    topic = message.topic
+    if topic is None:
+        topic = path.name if sources.of(path.name) else message_name(path)
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        raise fail(f"{where}, column {PAYLOAD!r}", "JSON", shown(text)) from None
+        # The payload of a topic that nobody asks for may be anything.
+        content = payload_of(message) if sources.of(topic) else None
+        came = None if message.arrival is None else nanoseconds(message.arrival, "s", f"{message.where}, arrival")
+        for reading in sources.read(topic, content, message.where):
+            arrival = reading.time if came is None else came
+            if arrival is None:
+                what = "a time field (time=...), or a field or column 'arrival'"
+                raise fail(f"{message.where}, {topic}", what, "neither")
+            if message.stored and reading.time is None:
+                sources.stored += 1
+                continue
+            events.add(sources.original(reading, came), arrival)
+    except InputError as error:
+        events.refuse(error, strict)
+
+
+def _conclude(path: Path, sources: Sources, events: EventTable) -> None:
+    """Say which messages were left out.
+
+    Raises:
+        ValueError: a field that no message of its topic had.
+    """
+    if said := sources.never():
+        raise InputError(said)
+    if sources.unknown.total():
+        counts = ", ".join(f"{topic} ({count})" for topic, count in sources.unknown.items() if count)
+        events.notes.append(f"{path}: not among the sources: {counts}")
+    if sources.excluded:
+        counts = ", ".join(f"{topic} ({count})" for topic, count in sources.excluded.items())
+        events.notes.append(f"{path}: left out by where=: {counts}")
+    if sources.stored:
+        events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
+    if sources.steps is False and not len(events) and not events.reasons and not events.broken:
+        raise fail(str(path), f"a message of the sources, {', '.join(sources.topics[:8])}", "none")

@@ -1,5 +1,6 @@
 """Recordings and estimates in files: a table of times, inputs and measurements; one of means and covariances."""
 
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -8,11 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.files.table import TIME, columns_of, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
-from heliograph.numerics.check import backwards, backwards_text, fail, instance
+from heliograph.numerics.check import backwards, backwards_text, fail, flag, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import with_unit
@@ -34,7 +36,7 @@ class Recording(NamedTuple):
     truth: np.ndarray | None = None
 
 
-def read_recording(table: object, network: Network, name: str = "recording") -> Recording:
+def read_recording(table: object, network: Network, name: str = "recording", ignore_unknown: bool = False) -> Recording:
     """Read measured data for a network from a CSV or Parquet file, a DataFrame, or a dictionary of columns.
 
     Columns: `time`, numbers or dates of ISO 8601, which never goes backwards; each plant input by its name (an input
@@ -42,12 +44,15 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
     the first row); each received component by `node.name` or, if the name is unique, by `name`. Components are named as
     the sensor's outputs if the channel keeps their number, else z0, z1, ... A measurement that is empty or NaN did not
     arrive. Measurements of a relay may be left out altogether. A column `truth.STATE` holds the true value of a state,
-    empty where it is not known.
+    empty where it is not known. Where most rows have the time of the row before, as of stamps that lost their digits,
+    there is a warning.
 
     Args:
         table: path of the file, DataFrame, or columns by name.
         network: the network that the columns belong to.
         name: name of a table without a file, for errors.
+        ignore_unknown: whether columns that the network does not know are left out (default False: they are refused,
+            since they may be misspelt).
 
     Raises:
         ValueError: no table of numbers; unknown, missing or doubled columns; a time or an input that is missing;
@@ -56,7 +61,9 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
     """
     instance("network", network, Network, "a Network")
     source = str(table) if isinstance(table, str | Path) else name
-    return _recording_of(columns_of(table, source), network, source)
+    headers = _headers(network)
+    columns = columns_of(table, source, headers if flag("ignore_unknown", ignore_unknown) else None)
+    return _recording_of({headers.get(name, name): values for name, values in columns.items()}, network, source)
 
 
 def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
@@ -88,22 +95,27 @@ def _truth_columns(network: Network) -> dict[str, str]:
     return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
-def _without_units(columns: Mapping[str, np.ndarray], network: Network) -> dict[str, np.ndarray]:
-    """Return columns by name alone, where a header has the unit of its state, input or output: "range (m)"."""
-    received = [name for node in network.nodes.values() for name in node.received_names]
-    known = {with_unit(name): str(name) for name in (*network.states, *network.inputs, *received)}
-    known |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
-    known |= {
-        f"{node}.{with_unit(name)}": f"{node}.{name}"
-        for node, receiver in network.nodes.items()
-        for name in receiver.received_names
-    }
-    return {known.get(column, column): values for column, values in columns.items()}
+def _headers(network: Network) -> dict[str, str]:
+    """Return the name that a column has here by the header that it may have.
+
+    That is the name, with the unit of its state, input or output ("range (m)") or without, also as `write_table` writes
+    what no cell can hold.
+    """
+    received = {node: receiver.received_names for node, receiver in network.nodes.items()}
+    names = [*network.states, *network.inputs, *(name for of in received.values() for name in of)]
+    headers = {with_unit(name): str(name) for name in names}
+    headers |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
+    headers |= {f"{node}.{with_unit(name)}": f"{node}.{name}" for node, of in received.items() for name in of}
+    plain = [TIME, *headers.values()]
+    return (
+        {from_cell(in_cell(header).strip()): name for header, name in headers.items()}
+        | headers
+        | dict(zip(plain, plain, strict=True))
+    )
 
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
     inputs, received = network.inputs, _received_columns(network)
-    columns = _without_units(columns, network)
     # A relay whose measurements are left out altogether loses its filter only.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
@@ -123,6 +135,7 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     if row is not None:
         came = backwards_text(time, row)
         raise fail(f"{source}, row {row + 1}, column {TIME!r}", "a time that does not go backwards", came)
+    _warn_of_equal_times(time, source)
     measurements = {
         node: np.stack([_measured(columns, find(names), source) for names in components], axis=1)
         for node, components in received.items()
@@ -249,8 +262,20 @@ def _times(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndar
     return values.astype("datetime64[ns]")
 
 
+def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
+    """Warn where most rows have the time of the row before: stamps that were cut or rounded look like this."""
+    _, counts = np.unique(time, return_counts=True)
+    if len(time) > 2 and 2 * len(counts) <= len(time):
+        shared = int(counts[counts > 1].sum())
+        warnings.warn(
+            f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
+            f"that lost their digits; {len(counts)} times in all",
+            stacklevel=4,
+        )
+
+
 def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    values = _numbers(columns, name, source)
+    values = columns[name] if columns[name].dtype.kind == "i" else _numbers(columns, name, source)
     _refuse(~np.isfinite(values), values, f"column {name!r}", "a finite number", source)
     return values
 

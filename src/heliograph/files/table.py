@@ -1,34 +1,41 @@
 """Tables in files: columns of numbers in CSV or Parquet; the file extension selects the format."""
 
 import csv
+import gzip
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
 from heliograph.disk.quoting import from_cell, in_cell
-from heliograph.disk.whole_file import check_output, format_of, whole_file
+from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
 from heliograph.numerics.check import InputError, fail, file_path, shown, table, unmasked
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 from heliograph.numerics.types import Shaped
 
 TIME = "time"
+PACKED = ".gz"
+EXACT = 2**53  # up to here doubles hold every whole number
 
 
-def columns_of(table: object, name: str = "table") -> dict[str, np.ndarray]:
-    """Return columns by name, numbers as float64 and dates as datetime64[ns] in UTC; missing values are NaN or NaT."""
+def columns_of(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
+    """Return columns by name, missing values NaN or NaT: numbers as float64, dates as datetime64[ns] in UTC.
+
+    Whole numbers that float64 cannot tell apart stay int64. Columns that are not among `only` are left out unread.
+    """
     if isinstance(table, str | os.PathLike):
-        return read_table(Path(table))
+        return _read_table(Path(table), only)
     if isinstance(table, Mapping):
         named = dict(table)
     elif hasattr(table, "columns") and hasattr(table, "__getitem__"):
         frame: Any = table
         index = getattr(frame, "index", None)
+        _check_distinct(name, list(frame.columns))
         named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in frame.columns else {}
         named |= {column: frame[column] for column in frame.columns}
     else:
@@ -36,7 +43,8 @@ def columns_of(table: object, name: str = "table") -> dict[str, np.ndarray]:
     for column in named:
         if not isinstance(column, str):
             raise fail(f"{name}, columns", "names that are text", shown(column))
-    return {column: _values(values, f"{name}, column {column!r}") for column, values in named.items()}
+    kept = {column: values for column, values in named.items() if only is None or column in only}
+    return {column: _values(values, f"{name}, column {column!r}") for column, values in kept.items()}
 
 
 def _values(values: Any, name: str) -> np.ndarray:
@@ -46,18 +54,41 @@ def _values(values: Any, name: str) -> np.ndarray:
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
     column = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(unmasked(values))
     if column.dtype.kind == "M":
-        return np.asarray(column.astype("datetime64[ns]"))
+        return in_nanoseconds(column, name)
     if column.dtype.kind in "fiub":
-        return np.asarray(column, dtype=np.float64)
+        return numbers_of(column)
     if column.dtype.kind in "OUT":
         return _of_objects(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
 
 
+def numbers_of(column: np.ndarray) -> np.ndarray:
+    """Return numbers as float64, or as int64 where that alone tells them apart."""
+    whole = column.dtype.kind in "iu" and column.size and np.abs(column.astype(np.float64)).max() >= EXACT
+    return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)
+
+
+def in_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
+    """Return dates as datetime64[ns].
+
+    Raises:
+        ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
+    """
+    moments = column.astype("datetime64[ns]")
+    # There and back: what wraps or is cut is another date then.
+    wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise fail(f"{name}, row {row + 1}", "a date in whole nanoseconds, from 1678 to 2261", column[row])
+    return np.asarray(moments)
+
+
 def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
     """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
     some = next((value for value in column if value is not None), None)
-    if isinstance(some, str) or hasattr(some, "isoformat"):
+    if hasattr(some, "to_timestamp"):  # a period of pandas: its first moment
+        return dates([None if value is None else value.to_timestamp() for value in column], name)
+    if (isinstance(some, str) and looks_like_date(some)) or hasattr(some, "isoformat"):
         return dates(column, name)
     texts = [x for x in column if isinstance(x, str | bytes)]  # text is no number, though it may read as one
     try:
@@ -65,10 +96,13 @@ def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
             raise TypeError
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):
-        raise fail(name, "numbers or dates", shown(texts[0] if texts else some)) from None
+        raise fail(
+            name, "numbers or dates", shown(str(texts[0]) if texts and isinstance(texts[0], str) else some)
+        ) from None
 
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+COMMENTS = ("#", "%")
 MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
 
 
@@ -89,13 +123,17 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
             Rows count from 1.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    path = file_path("table", path)
-    kind = format_of(path)
+    return _read_table(file_path("table", path), None)
+
+
+def _read_table(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
+    """Read the columns of a file, or those of them that are among `only`."""
+    kind = kind_of(path) if kind_of(path) in FORMATS else format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:
         raise fail(str(path), "a table with a header and rows", "an empty file")
-    columns = _read_csv(path) if kind == ".csv" else _read_parquet(path)
+    columns = _read_csv(path, only) if kind == ".csv" else _read_parquet(path, only)
     if not columns or not len(next(iter(columns.values()))):
         raise fail(str(path), "at least one row", "none")
     return columns
@@ -131,19 +169,38 @@ def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
         raise fail("columns of a table", "at least one, all of one length", lengths)
 
 
-def _check_distinct(path: Path, header: Sequence[str]) -> None:
+def _check_distinct(source: object, header: Sequence[object]) -> None:
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
-        raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")
+        raise fail(f"{source}, header", "distinct columns", f"{twice[0]!r} more than once")
+
+
+def kind_of(path: Path) -> str:
+    """Return the extension of a file in small letters, without .gz where it is packed."""
+    return (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
+
+
+@contextmanager
+def opened_text(path: Path) -> Iterator[TextIO]:
+    """Open a file of text in UTF-8, packed or not; ValueError for what is none."""
+    try:
+        if path.suffix.lower() == PACKED:
+            with gzip.open(path, "rt", newline="", encoding="utf-8-sig") as file:
+                yield file
+        else:
+            with path.open(newline="", encoding="utf-8-sig") as file:
+                yield file
+    except (UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
+        raise fail(str(path), "a text in UTF-8", str(error)) from None
 
 
 @contextmanager
 def csv_lines(path: Path) -> Iterator[Iterator[list[str]]]:
     """Lines of a CSV file that are not empty; ValueError for text that is no CSV in UTF-8."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with opened_text(path) as file:
             yield (line for line in csv.reader(file, strict=True) if line)
-    except (csv.Error, UnicodeDecodeError) as error:
+    except csv.Error as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
 
 
@@ -156,12 +213,15 @@ def csv_header(path: Path) -> list[str]:
         return []
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
+def _read_csv(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
     # Cells as text; every row must have as many as the header.
     with csv_lines(path) as lines:
         header = [from_cell(name.strip()) for name in next(lines, [])]
         _check_header(path, header)
         rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
+    if only is not None:
+        kept = [i for i, name in enumerate(header) if name in only]
+        header, rows = [header[i] for i in kept], [[cells[i] for i in kept] for cells in rows]
     # The first row decides which columns are dates; all others are numbers.
     dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
     numbers = [
@@ -169,8 +229,17 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         for row, cells in enumerate(rows, 1)
     ]
     values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
-    columns = {name: values[:, i].copy() for i, name in enumerate(header)}
+    columns = {name: _exact(values[:, i].copy(), [cells[i] for cells in rows]) for i, name in enumerate(header)}
     return columns | {header[i]: dates((cells[i] for cells in rows), f"{path}, column {header[i]!r}") for i in dated}
+
+
+def _exact(values: np.ndarray, cells: Sequence[str]) -> np.ndarray:
+    """Return a column as int64 if its cells are whole numbers that doubles cannot tell apart."""
+    if not np.any(np.abs(values) >= EXACT) or not all(
+        re.fullmatch(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}", c) for c in cells
+    ):
+        return values
+    return np.array([int(cell) for cell in cells], dtype=np.int64)
 
 
 def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
@@ -188,8 +257,11 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
             raise ValueError
         return float(cell) if cell else np.nan
     except ValueError:
-        comma = re.fullmatch(r"[+-]?\d+,\d+", cell)
-        hint = f": numbers have a decimal point: {_rewriting(path, decimal=',')}" if comma else ""
+        hint = ""
+        if re.fullmatch(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", cell):
+            hint = f": thousands have no comma: {_rewriting(path, thousands=',')}"
+        elif re.fullmatch(r"[+-]?\d+,\d+", cell):
+            hint = f": numbers have a decimal point: {_rewriting(path, decimal=',')}"
         if re.fullmatch(r"[-+.\de]+(?: +[-+.\de]+)+", cell):
             hint = ": several numbers: " + _rewriting(path, sep="\\s+")
         if cell.lower() in MISSING:
@@ -200,9 +272,8 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
-    if line.startswith("#"):
-        remedy = _rewriting(path, comment="#")
-        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {remedy}")
+    if line.startswith(COMMENTS):
+        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {_uncommented(path)}")
     for mark, name in SEPARATORS.items() if len(header) == 1 else ():
         if mark in line:
             with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -212,13 +283,29 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     _check_distinct(path, header)
 
 
-def _rewriting(path: Path, **how: str) -> str:
+def _uncommented(path: Path) -> str:
+    """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
+    with opened_text(path) as file:
+        lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]
+    comments = next((i for i, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
+    following = lines[comments] if comments < len(lines) else "0"
+    mark = next((mark for mark in (",", *SEPARATORS) if mark in following), r"\s+")
+    first = re.split(mark if mark == r"\s+" else re.escape(mark), following)[0]
+    sep = {} if mark == "," else {"sep": mark}
+    if not re.match(r"[-+.\d]", first):  # names of their own
+        return _rewriting(path, comment=lines[0][0], **sep)
+    title = lines[comments - 1].lstrip("".join(COMMENTS) + " ")
+    split = [part.strip() for part in re.split(mark if mark == r"\s+" else re.escape(mark), title) if part.strip()]
+    return _rewriting(path, skiprows=comments, names=split, **sep)
+
+
+def _rewriting(path: Path, **how: object) -> str:
     """Return the pandas call that converts a table written in another dialect."""
     given = "".join(f", {name}={value!r}" for name, value in how.items())
     return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
 
-def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarray]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -230,10 +317,19 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     _check_distinct(path, table.column_names)
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
+        if only is not None and name not in only:
+            continue
         # Timestamps keep their nanoseconds; other temporal types and nested ones are refused.
         kind = column.type
         if pa.types.is_timestamp(kind):
-            columns[name] = np.array(column.cast(pa.timestamp("ns", kind.tz)).to_numpy(), dtype="datetime64[ns]")
+            moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
+            columns[name] = in_nanoseconds(moments, f"{path}, column {name!r}")
+            continue
+        if pa.types.is_date(kind):
+            columns[name] = in_nanoseconds(column.cast(pa.date32()).to_numpy(), f"{path}, column {name!r}")
+            continue
+        if pa.types.is_integer(kind) and not column.null_count:
+            columns[name] = numbers_of(column.to_numpy())
             continue
         if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
             raise fail(f"{path}, row 1, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")

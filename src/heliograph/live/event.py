@@ -11,6 +11,9 @@ Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausibl
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 WHOLE = "a whole number from 0 to 2^63 - 1"
 OF_STEPS = "any times: a plant with the input 'dt', such as LinearPlant(lambda u: F(u[0]), ..., inputs=['dt'])"
+# How much later than its arrival an event may have been measured, in seconds or steps: clocks that are set over a
+# network agree to some ten milliseconds, over the internet too, and those that do not are wrong by more.
+AHEAD = 0.1
 INPUTS = "inputs"  # the node whose events are the plant's inputs
 
 

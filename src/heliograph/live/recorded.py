@@ -33,7 +33,13 @@ class Played:
 
 
 def play(
-    network: Network, events: Iterable[Event], window: float, lag: float | None = None, start: float = 0.0
+    network: Network,
+    events: Iterable[Event],
+    window: float,
+    lag: float | None = None,
+    start: float = 0.0,
+    ahead: float = 0.0,
+    capacity: int = 1000,
 ) -> Played:
     """Push events in order of arrival, and advance the time until all are final.
 
@@ -45,13 +51,15 @@ def play(
         window: how late an event may be, in the unit of time of the network.
         lag: fixed lag of the smoothed estimates, at most `window`; None for no smoothing.
         start: start of continuous time (default 0).
+        ahead: how much later than its arrival the time of an event may be (default 0).
+        capacity: greatest number of rows held (default 1000); beyond it the oldest become final.
 
     Raises:
         ValueError: no events, a lag beyond the window, and what `Timeline` refuses.
     """
     if lag is not None and not 0 <= lag <= window:
         raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
-    timeline = Timeline(network, window, start)
+    timeline = Timeline(network, window, start, ahead, capacity)
     # Order of arrival; without an arrival time an event arrives when it is measured.
     coming = sorted(events, key=_arrival) if isinstance(events, Sequence) else events
     finals: list[Record] = []

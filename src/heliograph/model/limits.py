@@ -9,6 +9,8 @@ from heliograph.numerics.check import fail, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
+ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor in it, relative
+
 LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
 
 
@@ -24,6 +26,9 @@ def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits 
 
 class Limits(Module):
     """Received numbers that count as missing: those below `low` or above `high`, and those equal to a code.
+
+    A number is equal to a code up to the rounding of a product, since sensors send whole numbers that are scaled, or if
+    it is the code in single precision, in which many sensors send.
 
     Args:
         received: length m of a measurement.
@@ -46,18 +51,29 @@ class Limits(Module):
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that counts as missing; NaN is not one of them."""
-        codes = (z[..., None] == self.invalid).any(axis=-1) if len(self.invalid) else False
-        return np.asarray((z < self.low) | (z > self.high) | codes)
+        return np.asarray((z < self.low) | (z > self.high) | is_code(z, self.invalid))
 
     def why(self, z: Float[np.ndarray, " m"], names: Sequence[str]) -> str:
         """Describe in words the components of a measurement that count as missing; "" if there are none."""
         said = []
         for i in np.flatnonzero(self.outside(z)).tolist():
-            code = np.any(z[i] == self.invalid)
+            code = is_code(z[i], self.invalid)
             said.append(
                 f"{names[i]} {z[i]:g} " + ("is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}")
             )
         return ", ".join(said)
+
+
+def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
+    """Return whether each number is a code, up to the rounding of a product, or as single precision has it."""
+    numbers = np.asarray(z, dtype=np.float64)[..., None]
+    if not len(codes):
+        return np.zeros(numbers.shape[:-1], dtype=bool)
+    rounding = ROUNDING * np.abs(codes)
+    with np.errstate(over="ignore"):
+        single = codes.astype(np.float32).astype(np.float64)
+    near = (np.abs(numbers - codes) <= rounding) | (np.abs(numbers - single) <= rounding)
+    return np.asarray(near.any(axis=-1))
 
 
 def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:

@@ -276,7 +276,10 @@ def check_horizon(value: object, covered: int | None = None) -> int:
 
 
 def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Return `count` times that do not go backwards: numbers, or dates (datetime64), then to the nanosecond."""
+    """Return `count` times that do not go backwards: numbers, or dates (datetime64), then to the nanosecond.
+
+    Whole numbers that doubles cannot tell apart stay what they are.
+    """
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
         clock: np.ndarray = np.asarray(value).astype("datetime64[ns]")
         if clock.shape != (count,) or np.isnat(clock).any():
@@ -285,6 +288,9 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
             )
     else:
         clock = array(name, value, (count,))
+        whole = np.asarray(value)
+        if whole.dtype.kind in "iu" and np.abs(clock).max(initial=0) >= 2**53:  # doubles cannot tell these apart
+            clock = whole
     row = backwards(clock)
     if row is not None:
         raise fail(name, "times that do not go backwards", f"{backwards_text(clock, row)} in row {row + 1}")

@@ -11,16 +11,17 @@ from heliograph.numerics.check import fail, shown
 
 DATE = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.]\d{1,9})?)?))?"
-    r" ?(?P<zone>Z|UTC|[+-]\d\d(?::?\d\d)?)?"
+    r" ?(?P<zone>Z?[+-]\d\d(?::?\d\d)?|Z|UTC)?"  # mosquitto_sub writes Z+0100
 )
+MONTH = re.compile(r"(?P<year>\d{4})-(?:(?P<month>\d\d)|Q(?P<quarter>[1-4]))|(?P<of>\d{4})Q(?P<quarter_of>[1-4])")
 UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
 YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 
 def looks_like_date(text: str) -> bool:
-    """Return whether a text begins like a date of ISO 8601."""
-    return re.match(r"\d{4}-\d\d-", text) is not None
+    """Return whether a text begins like a date of ISO 8601, or is a month (2026-11) or a quarter (2026Q4)."""
+    return re.match(r"\d{4}-\d\d-", text) is not None or MONTH.fullmatch(text) is not None
 
 
 def dates(texts: Iterable[object], name: str) -> np.ndarray:
@@ -33,19 +34,33 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
             results.append(MISSING)
             continue
         # Nanoseconds since 1970 in UTC.
-        match = DATE.fullmatch(text)
-        try:
-            if match is None:
-                raise ValueError
-            results.append(_instant(match))
-        except ValueError:
-            expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
-            raise fail(f"{name}, row {row}", expected, shown(text)) from None
+        moment, zoned = moment_of(text, f"{name}, row {row}")
+        results.append(moment)
         # Local times and times with a zone cannot be compared.
-        zones.add(match["zone"] is not None)
+        zones.add(zoned)
         if len(zones) > 1:
             raise fail(f"{name}, row {row}", "a zone with every date or with none", shown(text))
     return np.array(results, dtype=np.int64).view("datetime64[ns]")
+
+
+def moment_of(text: str, name: str) -> tuple[int, bool]:
+    """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month or quarter is its first day.
+
+    Raises:
+        ValueError: no date of ISO 8601, or one beyond what nanoseconds can say.
+    """
+    text = text.strip()
+    if month := MONTH.fullmatch(text):
+        quarter = month["quarter"] or month["quarter_of"]
+        text = f"{month['year'] or month['of']}-{month['month'] or f'{3 * int(quarter) - 2:02}'}-01"
+    match = DATE.fullmatch(text)
+    try:
+        if match is None:
+            raise ValueError
+        return _instant(match), match["zone"] is not None
+    except ValueError:
+        expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
+        raise fail(name, expected, shown(text)) from None
 
 
 def _instant(match: re.Match[str]) -> int:
@@ -53,8 +68,8 @@ def _instant(match: re.Match[str]) -> int:
     if int(match["day"][:4]) not in YEARS:
         raise ValueError
     nanoseconds = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
-    zone = match["zone"] or "Z"
-    if zone in ("Z", "UTC"):
+    zone = _offset(match["zone"])
+    if zone == "Z":
         return nanoseconds
     hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
     if hours > 23 or minutes > 59:
@@ -63,12 +78,17 @@ def _instant(match: re.Match[str]) -> int:
     return nanoseconds - ahead if zone[0] == "+" else nanoseconds + ahead
 
 
+def _offset(zone: str | None) -> str:
+    """Return the zone of a date as an offset, Z for UTC and for none."""
+    return "Z" if zone in (None, "Z", "UTC") else str(zone).removeprefix("Z")
+
+
 def instant(text: str) -> datetime:
     """A date of ISO 8601 with its zone, to the microsecond."""
     match = DATE.fullmatch(text)
     if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
         raise ValueError
-    zone = "+00:00" if match["zone"] in ("Z", "UTC") else match["zone"]
+    zone = _offset(match["zone"]).replace("Z", "+00:00")
     return datetime.fromisoformat(f"{match['day']}T{match['clock'] or '00:00'}{zone}")
 
 

@@ -105,10 +105,8 @@ def _within(name: str, node: Node | ReceivingNode, z: Float[np.ndarray, "steps m
     if node.limits is None or not (outside := node.limits.outside(z)).any():
         return z
     row, count = int(np.argmax(outside.any(axis=1))), int(outside.sum())
-    said = node.limits.why(z[row], node.received_names)
-    warnings.warn(
-        f"node {name!r}: {count} of {z.size} values count as not arrived; row {row + 1}: {said}", stacklevel=3
-    )
+    came, said = int(np.count_nonzero(~np.isnan(z))), node.limits.why(z[row], node.received_names)
+    warnings.warn(f"node {name!r}: {count} of {came} values count as not arrived; row {row + 1}: {said}", stacklevel=3)
     return np.where(outside, np.nan, z)
 
 

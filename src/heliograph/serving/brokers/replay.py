@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.events import holds_events, read_events
 from heliograph.files.recording import read_recording
 from heliograph.files.table import columns_of
 from heliograph.live.event import INPUTS, Event
@@ -36,7 +35,7 @@ class Link(NamedTuple):
 
 
 def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 | None]:
-    """Read the events of a file, of rows or of events, in order of arrival, and the date of time 0.
+    """Read the events of a table of rows, in order, and the date of time 0.
 
     Each row's measurements become events. In continuous time an input holds from its event on, so the inputs of a row
     are dated at the row before.
@@ -53,10 +52,8 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     """
     path = file_path("recording", path)
     instance("network", network, Network, "a Network")
-    if holds_events(path):
-        return read_events(path, network)
-    # Time of each row: its index if the network counts steps, else seconds.
     table = read_recording(path, network)
+    # Time of each row: its index if the network counts steps, else seconds.
     dated = table.time.dtype.kind == "M"
     origin = table.time[0] if dated else None
     steps = TIME_STEP not in network.inputs

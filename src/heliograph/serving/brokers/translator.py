@@ -1,16 +1,20 @@
 """Messages of topics that others make, to messages of a network by its sources."""
 
-import json
-from collections import Counter
+from collections import Counter, OrderedDict
 from datetime import UTC, datetime, timedelta
 
+from heliograph.files.event_columns import YEAR
+from heliograph.files.fields import decoded, nanoseconds
+from heliograph.files.message_files import log_line, of_log
 from heliograph.files.sources import Reading, Sources
 from heliograph.numerics.check import InputError, fail, shown
 from heliograph.serving.message import LONGEST, Message
 from heliograph.simulation.network import Network
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+MICROSECOND = timedelta(microseconds=1)
 LISTED = 8  # unknown topics in one line
+REMEMBERED = 10_000  # times of messages without a count
 NAME = 200  # characters of a plant's name
 
 
@@ -18,8 +22,10 @@ class Translator:
     """Sources of a network, applied to messages as they come.
 
     A measurement without a time is of the moment of its arrival, and counted here. Where a time names it but no count,
-    its count is 0, so that a message that comes again is known. A message that a broker had stored for new subscribers
-    is left out where only its arrival would date it. Unknown topics are counted, never guessed.
+    those of a node with one time are told apart by their order; of a broker, which may send a message again, one with
+    the same values is the same message. A message that a broker had stored for new subscribers is left out where only
+    its arrival would date it. A stamp that is more than a year before a known arrival is refused. Unknown topics are
+    counted, never guessed.
 
     Args:
         table: sources by topic, as in a network's file.
@@ -32,6 +38,8 @@ class Translator:
     def __init__(self, table: object, network: Network):
         self.sources = Sources(table, network)
         self._counts, self._stored = Counter[tuple[str, str]](), 0
+        # Values of the newest times of each plant and node without a count.
+        self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
 
     def read(self, topic: str, payload: bytes, arrival: datetime, stored: bool = False) -> list[Message | str]:
         """Return the messages in a payload of a topic, or the reason why it cannot be read; nothing of unknown topics.
@@ -42,25 +50,30 @@ class Translator:
             arrival: when it arrived.
             stored: whether the broker had stored it for new subscribers.
         """
-        try:
-            return self._messages(topic, _decoded(payload, topic), arrival, stored)
-        except InputError as error:
-            return [str(error)]
+        return self._read(topic, payload, arrival, stored, again=True)
 
     def line(self, payload: bytes) -> list[bytes | Message | str]:
-        """Return a line of a pipe as it is, or the messages in it if it has a `topic` and a `payload`.
+        """Return a line of a pipe as it is, or the messages in it if it has a topic and a payload.
 
-        So prints `mosquitto_sub -F %j` or `%J`.
+        So MQTT clients print, `mosquitto_sub -F %j`, `-F "%I %t %p"` or `-v` for example. What a line says of its
+        arrival is used; one that says nothing arrives when it was measured, and at the present at the latest.
         """
         try:
-            content = json.loads(payload[:LONGEST])
-        except (ValueError, RecursionError):
+            content = decoded(payload[:LONGEST], "line")
+        except InputError:
+            content = None
+        logged = of_log(content)
+        if logged is None and content is None:
+            parts = log_line(payload.decode(errors="replace"))
+            logged = parts and (*parts, False)
+        if logged is None:
             return [payload]
-        if not isinstance(content, dict) or not isinstance(content.get("topic"), str) or "payload" not in content:
-            return [payload]
-        inner = content["payload"]
-        body = inner.encode() if isinstance(inner, str) else json.dumps(inner).encode()
-        return list(self.read(content["topic"], body, datetime.now(UTC), bool(content.get("retain"))))
+        topic, inner, came, stored = logged
+        try:
+            arrival = None if came is None else moment(nanoseconds(came, "s", f"{topic}, arrival"))
+        except InputError as error:
+            return [str(error)]
+        return list(self._read(topic, inner.encode(), arrival, stored, again=False))
 
     def left_out(self) -> list[str]:
         """Return lines on messages that were not used: of unknown topics, and stored ones."""
@@ -69,29 +82,52 @@ class Translator:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
+        if self.sources.excluded:
+            named = ", ".join(f"{topic} ({count})" for topic, count in self.sources.excluded.most_common(LISTED))
+            lines.append(f"messages left out by where=: {named}")
+        if said := self.sources.never():
+            lines.append(f"a field that no message had: {said}")
         if self._stored:
             lines.append(f"{self._stored} stored messages were left out: without time= they have no date")
         return lines
 
-    def _messages(self, topic: str, content: object, arrival: datetime, stored: bool) -> list[Message | str]:
+    def _read(
+        self, topic: str, payload: bytes, arrival: datetime | None, stored: bool, again: bool
+    ) -> list[Message | str]:
+        """Read a payload; `again`: a message may be sent again."""
+        if not self.sources.of(topic):  # whatever it is
+            self.sources.unknown[topic] += 1
+            return []
         results: list[Message | str] = []
-        for reading in self.sources.read(topic, content, topic):
-            if stored and reading.time is None:
-                self._stored += 1
-                continue
-            results.append(self._message(topic, reading, arrival))
+        try:
+            for reading in self.sources.read(topic, _decoded(payload, topic), topic):
+                if stored and reading.time is None:
+                    self._stored += 1
+                    continue
+                results.append(self._message(topic, reading, arrival, again))
+        except InputError as error:
+            results.append(str(error))
         return results
 
-    def _message(self, topic: str, reading: Reading, arrival: datetime) -> Message:
+    def _message(self, topic: str, reading: Reading, known: datetime | None, again: bool) -> Message:
         if len(reading.plant) > NAME or "\0" in reading.plant:
             raise fail(f"{topic}, plant", f"a name of at most {NAME} characters, without NUL", shown(reading.plant))
+        arrival = datetime.now(UTC) if known is None else known
+        reading = self.sources.original(reading, None if known is None else (arrival - EPOCH) // MICROSECOND * 1000)
         time: datetime | float = arrival
-        if reading.time is not None:
-            counted = self.sources.steps and self.sources.step is None
-            time = float(reading.time) if counted else EPOCH + timedelta(microseconds=reading.time // 1000)
+        came: datetime | None = None
+        if reading.time is not None and self.sources.steps and self.sources.step is None:
+            time = float(reading.time)
+        elif reading.time is not None:
+            time = moment(reading.time)
+            if known is not None and (arrival - time) // MICROSECOND * 1000 > YEAR:
+                what = f"{topic}, time"
+                raise fail(what, f"a time that was set, near that of arrival, {arrival.isoformat()}", time.isoformat())
+            # What a log says; of what comes now only that it cannot have been measured later.
+            came = arrival if time > arrival or (known is not None and not again) else None
         sequence, name = reading.sequence, (reading.plant, reading.node)
         if sequence is None:
-            sequence = self._counts[name] if reading.time is None else 0
+            sequence = self._counts[name] if reading.time is None else self._order(reading, again)
             self._counts[name] += 1
         # Checked already, and dates are no texts here.
         return Message.model_construct(
@@ -101,16 +137,35 @@ class Translator:
             time=time,
             values=[None if value != value else value for value in reading.values.tolist()],
             inputs=None,
-            arrival=None,
+            arrival=came,
         )
+
+    def _order(self, reading: Reading, again: bool) -> int:
+        """Return the number of a message without a count among those of its node and time."""
+        assert reading.time is not None
+        values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
+        mine = reading.values.tobytes()
+        if again and mine in values:
+            return values.index(mine)
+        values.append(mine)
+        if len(self._uncounted) > REMEMBERED:
+            self._uncounted.popitem(last=False)
+        return len(values) - 1
+
+
+def moment(nanoseconds: int) -> datetime:
+    """Return a date, to the microsecond, from nanoseconds since 1970.
+
+    Raises:
+        ValueError: beyond the years that dates have.
+    """
+    try:
+        return EPOCH + timedelta(microseconds=nanoseconds // 1000)
+    except OverflowError:
+        raise fail("time", "a date of these thousand years", nanoseconds) from None
 
 
 def _decoded(payload: bytes, topic: str) -> object:
     if len(payload) > LONGEST:
         raise fail(topic, f"at most {LONGEST} bytes", len(payload))
-    try:
-        return json.loads(payload)
-    except ValueError:  # also bytes that are no text
-        raise fail(topic, "JSON", shown(payload)) from None
-    except RecursionError:
-        raise fail(topic, "JSON", "brackets nested too deeply") from None
+    return decoded(payload, topic)

@@ -1,0 +1,175 @@
+"""Reading of measured data for every command alike: rows of a table, or messages, of which a timeline uses some."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from heliograph.files.event_table import EventTable
+    from heliograph.files.recording import Recording
+    from heliograph.report.progress import Advance
+    from heliograph.simulation.network import Network
+
+WINDOW = 10.0  # how late a message may be, as of `heliograph serve`
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """Options of all commands that read measured data, as they are typed."""
+
+    window: Annotated[float | None, Parameter(help="Of messages: how late one may be; 10 unless given.")] = None
+    ahead: Annotated[
+        float | None, Parameter(help="Of messages: how much later than its arrival a time may be; 0.1 unless given.")
+    ] = None
+    plant: Annotated[str | None, Parameter(help="Of messages: the plant to read; all, unless given.")] = None
+    strict: Annotated[bool, Parameter(help="Stop at the first message that cannot be read.", negative="")] = False
+    ignore_unknown: Annotated[
+        bool, Parameter(help="Leave out columns that the network does not know.", negative="")
+    ] = False
+
+    @property
+    def of_messages(self) -> bool:
+        """Return whether an option is given that rows of time have not."""
+        return self.window is not None or self.ahead is not None or self.plant is not None
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Return the window, and how much later than its arrival a time may be."""
+        from heliograph.live.event import AHEAD
+        from heliograph.numerics.check import scalar
+
+        window = WINDOW if self.window is None else float(scalar("--window", self.window, 0))
+        return window, AHEAD if self.ahead is None else float(scalar("--ahead", self.ahead, 0))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measured data of one plant.
+
+    Attributes:
+        plant: its name; "" for a single one.
+        recording: rows in the order of measuring.
+        rows: whether something was measured in each; None for all.
+        events: the messages; None of rows.
+        summary: lines on what was used and what was left out.
+        warnings: lines on what could not be read.
+    """
+
+    plant: str
+    recording: "Recording"
+    rows: "np.ndarray | None" = None
+    events: "EventTable | None" = None
+    summary: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_measured(
+    path: Path,
+    reference: str,
+    network: "Network",
+    module: Mapping[str, object],
+    options: ReadingOptions,
+    advance: "Advance",
+) -> list[Measured]:
+    """Read the measured data of each plant: the same rows, whatever is done with them.
+
+    Raises:
+        ValueError: what cannot be read; options of messages, and rows of time; a plant that is not there.
+    """
+    from heliograph.numerics.check import fail
+
+    events = read_events(path, reference, network, module, options, advance)
+    if events is None:
+        if options.of_messages:
+            raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
+        return [_rows(path, network, options)]
+    wanted = events.plants if options.plant is None else [options.plant]
+    measured = [_of_events(events.of(plant), plant, options) for plant in wanted]
+    # What was read is said once.
+    measured[0].warnings.extend(said_of(path, events))
+    measured[-1].summary.extend(events.notes)
+    return measured
+
+
+def single(path: Path, measured: list[Measured]) -> Measured:
+    """Return the measured data of the only plant.
+
+    Raises:
+        ValueError: several plants; one line that names the option.
+    """
+    from heliograph.numerics.check import fail
+
+    if len(measured) > 1:
+        names = ", ".join(repr(each.plant) for each in measured[:8])
+        raise fail(f"{path}", f"one plant here, which --plant names (--plant {measured[0].plant})", names)
+    return measured[0]
+
+
+def read_events(
+    path: Path,
+    reference: str,
+    network: "Network",
+    module: Mapping[str, object],
+    options: ReadingOptions,
+    advance: "Advance",
+) -> "EventTable | None":
+    """Read the messages of a bag or a file; None for rows of time."""
+    from heliograph.files.bag import is_bag
+    from heliograph.files.messages import is_mapped, read_messages
+    from heliograph.numerics.check import fail
+
+    sources = module.get("sources")
+    if not is_mapped(path, sources):
+        return None
+    if sources is None and is_bag(path):
+        hint = f"heliograph inspect {path} --network {reference} suggests them"
+        raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
+
+    def progress(done: int, total: int) -> None:
+        advance(f"reading {path.name}", done, total)
+
+    return read_messages(path, network, sources, progress, options.strict, options.ignore_unknown)
+
+
+def _rows(path: Path, network: "Network", options: ReadingOptions) -> Measured:
+    from heliograph.files.recording import read_recording
+
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", UserWarning)
+        recording = read_recording(path, network, ignore_unknown=options.ignore_unknown)
+    return Measured("", recording, warnings=[str(doubt.message) for doubt in doubts])
+
+
+def _of_events(events: "EventTable", plant: str, options: ReadingOptions) -> Measured:
+    """Return the rows of a plant, and the verdicts on its events by node."""
+    import numpy as np
+
+    window, ahead = options.limits
+    counts, lost = events.judge(window, ahead)
+    lines = []
+    for node, verdicts in counts.items():
+        said = [f"{count} {verdict}" for verdict, count in verdicts.items() if count]
+        said += [f"{lost[node]} lost"] if lost.get(node) else []
+        lines.append(f"{plant + ', ' if plant else ''}{node}: {', '.join(said)}")
+    recording, rows = events.rows(window, ahead)
+    if events.dated:
+        lines.append(f"times in seconds since {np.datetime_as_string(events.date, timezone='UTC')}")
+    return Measured(plant, recording, rows, events, lines)
+
+
+def said_of(path: Path, events: "EventTable") -> list[str]:
+    """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
+    lines = [events.broken] if events.broken else []
+    if events.refused:
+        more = events.refused - len(events.reasons)
+        others = f"; and {more} more" if more > 0 else ""
+        count = f"messages that could not be read: {events.refused}"
+        lines.append(f"{path}: {count}; {'; '.join(events.reasons)}{others}")
+    return lines

@@ -1,0 +1,213 @@
+"""Events of a recording as arrays, and the verdicts on them that a timeline gives to one event after another."""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.live.event import VERDICTS, Verdict
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Bool, Float, Int
+
+SECOND = 10**9  # nanoseconds
+YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
+
+USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
+GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
+
+
+@dataclass
+class Columns:
+    """Events of one node: times and arrivals in nanoseconds, steps or numbers, counts (-1: none), `size` values each.
+
+    Attributes:
+        size: numbers of each event.
+        numbers: whether times are floats.
+        period: after how many messages the count begins at 0 again; 0 if it does not.
+    """
+
+    size: int
+    numbers: bool = False
+    period: int = 0
+    time: "array[Any]" = field(init=False)  # of int or float
+    arrival: "array[Any]" = field(init=False)
+    sequence: "array[int]" = field(default_factory=lambda: array("q"))
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def __post_init__(self) -> None:
+        self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " events"]]:
+        """Return times, arrivals and counts."""
+        return np.array(self.time), np.array(self.arrival), np.array(self.sequence, dtype=np.int64)
+
+    def keep(self, which: np.ndarray) -> None:
+        """Keep some of the events, by mask."""
+        columns, matrix = self.arrays(), self.matrix()[which]
+        self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
+        self.values = array("d", matrix.ravel())
+
+    def matrix(self) -> Float[np.ndarray, "events size"]:
+        """Return the values, a row for each event."""
+        return np.array(self.values).reshape(len(self.time), self.size)
+
+    def without_unset(self, name: str) -> tuple[str, str, int]:
+        """Leave out stamps that were not set; return what to say of the clock, why some were left out, and how many.
+
+        A stamp that is more than a year before its arrival, or zero where the others are of our days, was not set;
+        where most are, they are of another clock, and each event arrives when it was measured.
+        """
+        time, arrival, _ = self.arrays()
+        late = arrival - time
+        if not len(time):
+            return "", "", 0
+        if np.median(late) > YEAR:
+            self.arrival = array("q", self.time)
+            return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
+        unset = (late > YEAR) | ((time == 0) & bool(np.median(np.abs(time)) > YEAR))
+        count = int(np.count_nonzero(unset))
+        if not count:
+            return "", "", 0
+        got = f"{np.datetime64(int(time[np.argmax(unset)]), 'ns')} in {count} of {len(time)} messages"
+        self.keep(~unset)
+        return "", str(fail(name, "a time that was set, near that of arrival", got)), count
+
+
+class Events(NamedTuple):
+    """Events in order of arrival: node (-1: inputs), time, arrival, count, and place among those of the node.
+
+    Shapes: all (events,).
+    """
+
+    node: np.ndarray
+    time: np.ndarray
+    arrival: np.ndarray
+    sequence: np.ndarray
+    place: np.ndarray
+
+    def of(self, which: np.ndarray) -> "Events":
+        """Return some of the events, by number or by mask."""
+        return Events(*(column[which] for column in self))
+
+
+def judge(
+    events: Events,
+    values: Callable[[int], np.ndarray],
+    joint: bool,
+    window: float,
+    ahead: float,
+) -> Int[np.ndarray, " events"]:
+    """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
+
+    An event is in the future if its time is later than its arrival by more than `ahead`. It is late if an event that
+    came before it and belongs behind it was older than the arrival by more than the window. Of events of one node,
+    count and time the first stays. Where rows are joint, so does the first of a node's values at a time.
+
+    Args:
+        events: the events, in order of arrival.
+        values: the values of the event with a number.
+        joint: whether all events of one time are one row.
+        window: how late an event may be, in the unit of the times.
+        ahead: how much later than its arrival the time of an event may be.
+    """
+    verdicts = np.full(len(events.time), USED)
+    verdicts[events.time > events.arrival + ahead] = FUTURE
+    kept = np.flatnonzero(verdicts != FUTURE)
+    some = events.of(kept)
+    # In a row of its own an event stands after inputs of its time, then by node and count.
+    rank = _ranks(some.time) if joint else _ranks(some.time, some.node, some.sequence)
+    name = _ranks(some.time, some.node, some.sequence)
+    first = _first(name)
+    base = _base(some, rank, window)
+    late = (rank < base) | ((rank == base) & (first == np.arange(len(kept))))
+    verdicts[kept[late]] = LATE
+    # Of what has one name, the first stays.
+    for i in np.flatnonzero(~late & (first != np.arange(len(kept)))).tolist():
+        same = np.array_equal(values(int(kept[i])), values(int(kept[first[i]])), equal_nan=True)
+        verdicts[kept[i]] = DUPLICATE if same else CONFLICT
+    if joint:
+        _refuse_second_values(events, values, verdicts)
+    return verdicts
+
+
+def counted(node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]) -> dict[int, dict[Verdict, int]]:
+    """Count the verdicts of each node."""
+    return {
+        int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
+        for n in np.unique(node)
+    }
+
+
+def lost(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
+    """Count the gaps in a node's count, in the order of its times.
+
+    After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,
+    unless it follows after at most `GAP` messages.
+    """
+    if not len(time):
+        return 0
+    numbers = sequence[np.lexsort((sequence, time))]
+    steps = np.diff(numbers)
+    around = np.mod(steps, period) if period else steps
+    gaps = np.where(steps > 0, steps, np.where(around <= GAP, around, 1))
+    return int(np.sum(np.maximum(gaps - 1, 0)))
+
+
+def order_within(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+    """Return the number of each row among those that are equal to it, in their order, from 0."""
+    ranks = _ranks(*columns)
+    order = np.argsort(ranks, kind="stable")
+    first = np.searchsorted(ranks[order], ranks[order])
+    numbers = np.empty(len(order), dtype=np.int64)
+    numbers[order] = np.arange(len(order)) - first
+    return numbers
+
+
+def _ranks(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+    """Return the dense rank of each row by these columns, the first of which matters most."""
+    order = np.lexsort(columns[::-1])
+    new = np.zeros(len(order), dtype=bool)
+    for column in columns:
+        new[1:] |= column[order][1:] != column[order][:-1]
+    ranks = np.empty(len(order), dtype=np.int64)
+    ranks[order] = np.cumsum(new)
+    return ranks
+
+
+def _first(name: Int[np.ndarray, " events"]) -> Int[np.ndarray, " events"]:
+    """Return the number of the first event that has the name of each."""
+    _, first, inverse = np.unique(name, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse])
+
+
+def _base(events: Events, rank: Int[np.ndarray, " events"], window: float) -> Int[np.ndarray, " events"]:
+    """Return the rank of the newest row that is final when each event comes, -1 for none.
+
+    An event of time t is final for the events that come after it at more than t + window.
+    """
+    count = len(rank)
+    if not np.isfinite(window):
+        return np.full(count, -1)
+    watermark = events.arrival - window
+    final = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
+    newest = np.full(count + 1, -1)
+    np.maximum.at(newest, final, rank)
+    return np.maximum.accumulate(newest[:count])
+
+
+def _refuse_second_values(
+    events: Events, values: Callable[[int], np.ndarray], verdicts: Int[np.ndarray, " events"]
+) -> None:
+    """Where rows are joint: refuse an event that has a value where its row has one of the same node already."""
+    used = np.flatnonzero(verdicts == USED)
+    row = _ranks(events.time[used], events.node[used])
+    several: Bool[np.ndarray, " rows"] = np.bincount(row, minlength=1) > 1
+    filled = dict[int, np.ndarray]()
+    for i in np.flatnonzero(several[row]).tolist():
+        there, held = ~np.isnan(values(int(used[i]))), filled.get(int(row[i]))
+        if held is not None and np.any(there & held):
+            verdicts[used[i]] = CONFLICT
+        else:
+            filled[int(row[i])] = there if held is None else held | there

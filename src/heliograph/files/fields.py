@@ -1,0 +1,193 @@
+"""Fields of messages: what stands at a dotted path, and its conversion to a number, a time, a count or a name."""
+
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import lru_cache
+from math import isfinite
+from operator import attrgetter
+from typing import Any, Literal
+
+import numpy as np
+
+from heliograph.live.event import whole
+from heliograph.numerics.check import InputError, fail, shown
+from heliograph.numerics.dates import UNITS, dates, instant
+
+TimeUnit = Literal["s", "ms", "us", "ns", "step"]
+STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))  # ROS 2, ROS 1, protobuf
+PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
+NUMBER = "a number, true or false, or null for what did not arrive"
+# Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
+NO_NUMBERS = re.compile(
+    r'"(?:[^"\\]|\\.)*"|[-+]?\b(?:nan\([a-z0-9]*\)|(?:nan|inf(?:inity)?)\b|1\.#(?:q?nan|snan|ind|inf)\d*)',
+    re.IGNORECASE,
+)
+
+
+class MissingFieldError(InputError):
+    """A message has no field at a path."""
+
+
+class DoubledFieldError(ValueError):
+    """An object of JSON has a field twice."""
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON.
+
+    Raises:
+        DoubledFieldError: a field that is there twice, of which the last would win.
+    """
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise DoubledFieldError(next(name for name in names if names.count(name) > 1))
+    return fields
+
+
+def decoded(text: str | bytes, name: str) -> Any:
+    """Decode JSON, in which a bare nan or inf, as printf writes them, is null.
+
+    Raises:
+        ValueError: no JSON, or a field that is there twice; one line.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_distinct)
+    except DoubledFieldError as error:
+        raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
+    except ValueError:
+        pass
+    except RecursionError:
+        raise fail(name, "JSON", "brackets nested too deeply") from None
+    try:
+        words = text.decode() if isinstance(text, bytes) else text
+        words = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", words)
+        return json.loads(words, object_pairs_hook=_distinct)
+    except DoubledFieldError as error:
+        raise fail(name, "distinct fields", f"{error.args[0]!r} more than once") from None
+    except (ValueError, RecursionError):  # also bytes that are no text
+        raise fail(name, "JSON", shown(text)) from None
+
+
+def at(message: object, path: str, where: str) -> Any:
+    """Return the field at a dotted path of a message: of dictionaries, lists, arrays and objects with attributes.
+
+    Raises:
+        ValueError: no such field; one line with the path and the fields that are there.
+    """
+    # Objects first, since a bag has millions of them.
+    if path and not isinstance(message, PLAIN):
+        with suppress(AttributeError):
+            return _getter(path)(message)
+    value: Any = message
+    rest = path
+    while rest:
+        # A name that has dots itself comes first.
+        if isinstance(value, Mapping) and rest in value:
+            return value[rest]
+        name, _, rest = rest.partition(".")
+        if isinstance(value, Mapping) and name in value:
+            value = value[name]
+        elif name.isdigit() and isinstance(value, list | tuple | np.ndarray) and int(name) < len(value):
+            value = value[int(name)]
+        elif hasattr(value, name) and not isinstance(value, list | tuple | np.ndarray | Mapping | str | int | float):
+            value = getattr(value, name)
+        else:
+            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_fields(value)}")))
+    return value
+
+
+@lru_cache
+def _getter(path: str) -> "attrgetter[Any]":
+    return attrgetter(path)
+
+
+def number(value: Any, name: str, quoted: bool = False) -> float:
+    """Convert a value to a number; NaN for null and for what is not finite. A number may be `quoted` on request."""
+    if value is None or value == "":
+        return np.nan
+    if quoted and isinstance(value, str):
+        value = unquoted(value)
+    if not isinstance(value, bool | int | float | np.number | np.bool_):
+        raise fail(name, NUMBER, shown(value))
+    try:
+        numeric = float(value)
+    except OverflowError:
+        raise fail(name, NUMBER, shown(value)) from None
+    return numeric if isfinite(numeric) else np.nan
+
+
+def unquoted(text: str) -> int | float | str:
+    """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
+    words = text.strip()
+    for kind in (int, float) if "_" not in words else ():  # Python's own way to write a number, and nobody else's
+        with suppress(ValueError):
+            return kind(words)
+    return text
+
+
+def nanoseconds(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:
+    """Convert a time to nanoseconds since 1970, or to a step if that is its unit.
+
+    Raises:
+        ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
+    """
+    # Stamps of two whole numbers.
+    for pair in STAMPS if not isinstance(value, int | float | str) else ():
+        is_map = isinstance(value, Mapping)
+        if set(pair) <= value.keys() if is_map else hasattr(value, pair[0]) and hasattr(value, pair[1]):
+            seconds, rest = (int(value[part] if is_map else getattr(value, part)) for part in pair)
+            if seconds == rest == 0:
+                raise fail(name, "a time that was set (without time= it is the moment of arrival)", "a stamp of 0")
+            value, unit = seconds * 10**9 + rest, "ns"
+            break
+    # Dates, then numbers in their unit.
+    if isinstance(value, str):
+        value = unquoted(value) if quoted else value
+    if isinstance(value, str):
+        try:
+            instant(value)
+        except ValueError:
+            raise fail(name, "a date of ISO 8601 with its zone", shown(value)) from None
+        return int(dates([value], name)[0].astype(np.int64))
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+        raise fail(name, "a time: a date with its zone, a stamp, or a number", shown(value))
+    if unit == "step":
+        return count(value, name)
+    stamp = int(value) * UNITS[unit] if float(value).is_integer() else round(float(value) * UNITS[unit])
+    if not -(2**63) < stamp < 2**63:
+        raise fail(name, f"a time in {unit} since 1970", shown(value))
+    return stamp
+
+
+def count(value: Any, name: str, quoted: bool = False) -> int:
+    """Convert a running count, which columns of numbers have as a float."""
+    if quoted and isinstance(value, str):
+        value = unquoted(value)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return whole(name, value)
+
+
+def name_of(value: Any, name: str) -> str:
+    """Convert the name of a plant or a node: a text, or a whole number."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    if not isinstance(value, str):
+        raise fail(name, "a name", shown(value))
+    return value
+
+
+def _fields(value: object) -> str:
+    """Name the fields of a value, for an error."""
+    if isinstance(value, Mapping):
+        names = [str(key) for key in value]
+    elif hasattr(value, "__dataclass_fields__"):
+        names = list(value.__dataclass_fields__)
+    else:
+        return shown(value) if not isinstance(value, list | np.ndarray) else f"a list of {len(value)}"
+    return ", ".join(name for name in names if not re.match("__", name))[:200] or "an empty message"

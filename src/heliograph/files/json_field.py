@@ -1,0 +1,363 @@
+"""Descriptions of sources: which field of a message is which output, of which node and plant, and when."""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.files.fields import TimeUnit, at, name_of
+from heliograph.numerics.check import TINY, fail, flag, scalar, shown
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike
+
+COUNT_BITS = 16  # of a LoRaWAN frame
+
+
+@readable
+@dataclass(frozen=True)
+class Level:
+    """Level of a topic that names a plant or a node: of "zigbee2mqtt/garden" level 0 is "zigbee2mqtt".
+
+    Args:
+        index: number of the level, from 0; negative from the end.
+        names: name that a level's word stands for; a word that is not there is the name itself. None for no such names.
+    """
+
+    index: int
+    names: Mapping[str, str] | None = None
+
+    def of(self, topic: str, message: object, where: str) -> str:
+        """Return the name for a message of a topic."""
+        words = topic.split("/")
+        if not -len(words) <= self.index < len(words):
+            raise fail(where, f"a topic with a level {self.index}", repr(topic))
+        return (self.names or {}).get(words[self.index], words[self.index])
+
+
+@readable
+@dataclass(frozen=True)
+class Field:
+    """Field of a message that names a plant or a node, such as the identifier of an anchor.
+
+    Args:
+        path: dotted path of a text or of a whole number.
+        names: name that a value, as text, stands for; a value that is not there is the name itself. None for no such
+            names.
+    """
+
+    path: str
+    names: Mapping[str, str] | None = None
+
+    def of(self, topic: str, message: object, where: str) -> str:
+        """Return the name for a message of a topic."""
+        name = name_of(at(message, self.path, where), f"{where}, field {self.path!r}")
+        return (self.names or {}).get(name, name)
+
+
+@readable
+@dataclass(frozen=True)
+class Yaw:
+    """Heading of a quaternion, atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), in radians: a value in place of a path.
+
+    Args:
+        path: dotted path of the quaternion, which has the fields x, y, z and w.
+    """
+
+    path: str
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Return the paths of x, y, z and w."""
+        return tuple(f"{self.path}.{part}" if self.path else part for part in "xyzw")
+
+    @staticmethod
+    def of(x: Any, y: Any, z: Any, w: Any) -> Any:
+        """Return the heading, of numbers or of arrays; NaN where a part is missing or all are 0."""
+        size = x * x + y * y + z * z + w * w
+        return np.where(size > 0, np.arctan2(2 * (w * z + x * y), size - 2 * (y * y + z * z)), np.nan)
+
+
+@readable
+@dataclass(frozen=True)
+class Stamp:
+    """Time of a measurement in a message.
+
+    Args:
+        path: dotted path of the time.
+        offset: seconds added to it: negative for a stamp that is set late (default 0).
+    """
+
+    path: str
+    offset: float = 0.0
+
+
+@readable
+@dataclass(frozen=True)
+class Count:
+    """Running count of a node in a message; gaps in it are lost messages.
+
+    Args:
+        path: dotted path of the count.
+        bits: its bits, if it begins at 0 again after 2^bits - 1; None if it does not.
+    """
+
+    path: str
+    bits: int | None = None
+
+    @property
+    def period(self) -> int:
+        """Return after how many messages the count begins at 0 again; 0 if it does not."""
+        return 0 if self.bits is None else 1 << self.bits
+
+
+Name = TypeAliasType("Name", str | Level | Field)
+Path = TypeAliasType("Path", str | Yaw)
+Paths = TypeAliasType("Paths", str | Yaw | Sequence[str | Yaw])
+Texts = TypeAliasType("Texts", str | Sequence[str] | None)
+Time = TypeAliasType("Time", str | Stamp | None)
+Counted = TypeAliasType("Counted", str | Count | None)
+Plant = TypeAliasType("Plant", str | Level | Field | None)
+Conditions = TypeAliasType("Conditions", Mapping[str, object] | None)
+Containers = TypeAliasType("Containers", dict[str, Container[object]])
+Numbers = TypeAliasType("Numbers", tuple[float, ...])
+
+
+@readable
+@dataclass(frozen=True)
+class Source:
+    """One event of a node in each message of a topic, as `json_field` describes it.
+
+    Attributes:
+        paths: dotted path of each value in the message, or the `Yaw` of a quaternion.
+        node: name of the node, or "inputs"; or the `Level` or `Field` that names it.
+        outputs: name of each value among the node's outputs or the plant's inputs; empty for all of them.
+        scale: factor of each value.
+        offset: what is added to each value after that.
+        time: the time; None for the moment of arrival.
+        time_unit: unit of a time that is a number.
+        sequence: the node's running count; None if there is none.
+        plant: the `Level` or `Field` that names the plant; None for a single plant.
+        step: seconds of a step where times are counted in steps; None where they are not.
+        where: the values, or a container of them, that the field at each dotted path may have.
+        quoted: whether numbers may be texts.
+    """
+
+    paths: "tuple[Path, ...]"
+    node: "Name"
+    outputs: "tuple[str, ...]"
+    scale: "Numbers"
+    offset: "Numbers"
+    time: "Stamp | None"
+    time_unit: "TimeUnit"
+    sequence: "Count | None"
+    plant: "Level | Field | None"
+    step: "float | None"
+    where: "Containers"
+    quoted: bool
+
+    @property
+    def fields(self) -> list[str]:
+        """Return the dotted paths of all fields that a message needs."""
+        values = [part for path in self.paths for part in (path.parts if isinstance(path, Yaw) else (path,))]
+        given = (self.node, self.plant, self.time, self.sequence)
+        return [*values, *(part.path for part in given if isinstance(part, Field | Stamp | Count)), *self.where]
+
+
+def json_field(
+    path: "Paths",
+    node: "Name",
+    output: "Texts" = None,
+    *,
+    scale: "ArrayLike" = 1.0,
+    offset: "ArrayLike" = 0.0,
+    time: "Time" = None,
+    time_unit: "TimeUnit" = "s",
+    sequence: "Counted" = None,
+    plant: "Plant" = None,
+    step: float | None = None,
+    where: "Conditions" = None,
+    quoted: bool = False,
+) -> "Source":
+    """Map a field of a topic's messages, or several, to a node's outputs or to inputs of the plant.
+
+    A network's file maps topics by a dictionary `sources`; a topic that feeds several nodes has a list of fields:
+
+        sources = {"zigbee2mqtt/garden": hg.files.json_field("temp", node="garden", output="temperature")}
+
+    The same object reads JSON from MQTT, NATS, a pipe or a file, messages of a bag, and rows of a table, whose columns
+    are the fields. A path is dotted, with positions in lists as numbers ("pose.pose.position.x", "ranges.3"); a field
+    of that very name, dots included, comes first; "" is the message itself. A topic may have the wildcards of MQTT,
+    where `plant` or `node` says which sensor a message is of.
+
+    A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive. A
+    time is a date of ISO 8601 with its zone, a stamp of ROS, or a number since 1970 in `time_unit`; with the unit
+    "step" it is a step of a network that counts steps. Without `time` a measurement is of the moment of its arrival.
+    With `step` the moments are counted in steps of so many seconds: each is of the nearest step, the first of step 0.
+    A count that is absent is 0, as JSON of protobuf has it; a message that has its count and no value measured nothing.
+
+    Args:
+        path: dotted path of the value, or the `Yaw` of a quaternion, or several, which are then one measurement.
+        node: name of a node of the network, or "inputs"; or the `Level` of the topic or the `Field` that names it.
+        output: name of the output or input, one for each path; None for all of the node's, in their order.
+        scale: factor, of all values or of each. Shape () or (values,) (default 1).
+        offset: added after scaling, to all values or to each. Shape () or (values,) (default 0).
+        time: dotted path of the time, or its `Stamp`; None for the moment of arrival.
+        time_unit: unit of a time that is a number (default "s").
+        sequence: dotted path of the node's running count, or the `Count`; None if there is none.
+        plant: dotted path of the plant's name, or the `Level` or `Field` that has it; None if there is one plant.
+        step: seconds of a step of a network that counts steps, where times are dates; None for any other.
+        where: for each dotted path the value that the field must have, or several (a list, a set, a range), for the
+            message to be used, such as {"status": ["Good", "Uncertain"]} None for all messages.
+        quoted: whether numbers in quotes are numbers too (default False: they are refused).
+
+    Raises:
+        ValueError: no path, as many outputs as paths expected and others given, numbers that are not finite, another
+            unit of time, a step that is not positive.
+    """
+    paths = _paths(path)
+    outputs = () if output is None else _texts("output", output)
+    if not paths or (outputs and len(outputs) != len(paths)):
+        raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", shown(output))
+    if time_unit not in get_args(TimeUnit):
+        raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", shown(time_unit))
+    stamp = Stamp(time) if isinstance(time, str) else time
+    if not isinstance(stamp, Stamp | None):
+        raise fail("json_field, time", "a text or hg.files.Stamp", shown(time))
+    count = Count(sequence) if isinstance(sequence, str) else sequence
+    if not isinstance(count, Count | None):
+        raise fail("json_field, sequence", "a text or hg.files.Count", shown(sequence))
+    whose, of = _named("node", node), Field(plant) if isinstance(plant, str) else plant
+    seconds = None if step is None else float(scalar("json_field, step", step, TINY))
+    if time_unit == "step" and (seconds is not None or (stamp is not None and stamp.offset)):
+        raise fail("json_field, step", "none where the time is in steps already, and no offset", step)
+    factors, shifts = (_per_path(name, value, len(paths)) for name, value in (("scale", scale), ("offset", offset)))
+    return Source(
+        paths, whose, outputs, factors, shifts, stamp, time_unit, count, of and _named("plant", of),
+        seconds, _conditions(where), flag("json_field, quoted", quoted),
+    )  # fmt: skip
+
+
+def the_things_stack(
+    path: "Paths",
+    node: "Name",
+    output: "Texts" = None,
+    *,
+    scale: float = 1.0,
+    offset: float = 0.0,
+) -> "dict[str, Source]":
+    """Return the sources of uplinks of The Things Stack v3, a plant for each device: `sources = {**this, ...}`.
+
+    The time is that of the reception, the count that of the frames: absent at 0, and from 0 again after 65,535 frames
+    and after a device has joined again. An uplink without the field measured nothing.
+
+    Args:
+        path: dotted path within the decoded payload, or several, as of `json_field`.
+        node: name of a node of the network; or the `Field` that names it.
+        output: name of the output, one for each path; None for all of the node's.
+        scale: factor of the values (default 1).
+        offset: added after scaling (default 0).
+
+    Raises:
+        ValueError: what `json_field` refuses.
+    """
+    source = json_field(
+        _below("uplink_message.decoded_payload", path),
+        node,
+        output,
+        scale=scale,
+        offset=offset,
+        time="received_at",
+        sequence=Count("uplink_message.f_cnt", COUNT_BITS),
+        plant="end_device_ids.device_id",
+    )
+    return {"v3/+/devices/+/up": source}
+
+
+def chirpstack(
+    path: "Paths",
+    node: "Name",
+    output: "Texts" = None,
+    *,
+    scale: float = 1.0,
+    offset: float = 0.0,
+) -> "dict[str, Source]":
+    """Return the sources of uplinks of ChirpStack v4, a plant for each device: `sources = {**this, ...}`.
+
+    Time, count and what is absent are as in `the_things_stack`.
+
+    Args:
+        path: dotted path within the decoded object, or several, as of `json_field`.
+        node: name of a node of the network; or the `Field` that names it.
+        output: name of the output, one for each path; None for all of the node's.
+        scale: factor of the values (default 1).
+        offset: added after scaling (default 0).
+
+    Raises:
+        ValueError: what `json_field` refuses.
+    """
+    source = json_field(
+        _below("object", path),
+        node,
+        output,
+        scale=scale,
+        offset=offset,
+        time="time",
+        sequence=Count("fCnt", COUNT_BITS),
+        plant="deviceInfo.devEui",
+    )
+    return {"application/+/device/+/event/up": source}
+
+
+def _below(prefix: str, path: Paths) -> Paths:
+    """Return paths within a part of the message."""
+    if isinstance(path, Yaw):
+        return Yaw(f"{prefix}.{path.path}")
+    if isinstance(path, str):
+        return f"{prefix}.{path}"
+    below: list[Path] = [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in path]
+    return below
+
+
+def _paths(value: object) -> tuple[str | Yaw, ...]:
+    items = [value] if isinstance(value, str | Yaw) else value
+    if not isinstance(items, Sequence) or not all(isinstance(path, str | Yaw) for path in items):
+        raise fail("json_field, path", "a dotted path, hg.files.Yaw, or a list of these", shown(value))
+    return tuple(items)
+
+
+def _named(name: str, value: object) -> Any:
+    """Check what names a node or a plant."""
+    if not isinstance(value, str | Level | Field):
+        raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", shown(value))
+    return value
+
+
+def _conditions(where: object) -> dict[str, Container[object]]:
+    if where is None:
+        return {}
+    if not isinstance(where, Mapping) or not all(isinstance(path, str) for path in where):
+        raise fail("json_field, where", "a dictionary of paths with their values", shown(where))
+    single = str, int, float, bool, type(None)
+    values = {path: (value,) if isinstance(value, single) else value for path, value in where.items()}
+    for path, several in values.items():
+        if not isinstance(several, Container):
+            raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", shown(several))
+    return values
+
+
+def _texts(name: str, value: object) -> tuple[str, ...]:
+    items = [value] if isinstance(value, str) else value
+    if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
+        raise fail(f"json_field, {name}", "a text, or a list of texts", shown(value))
+    return tuple(items)
+
+
+def _per_path(name: str, value: ArrayLike, count: int) -> tuple[float, ...]:
+    """Return one number for each path."""
+    values = np.atleast_1d(np.asarray(value, dtype=object))
+    if values.ndim != 1 or len(values) not in (1, count):
+        raise fail(f"json_field, {name}", f"1 number, or {count}", shown(value))
+    numbers = [float(scalar(f"json_field, {name}", single)) for single in values]
+    return tuple(numbers * (count if len(numbers) == 1 else 1))

@@ -1,0 +1,211 @@
+"""Messages in files of tables and of lines: rows of CSV and Parquet, JSON lines, logs of MQTT clients; also packed."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from heliograph.files.fields import decoded, unquoted
+from heliograph.files.table import csv_header, csv_lines, kind_of, opened_text
+from heliograph.numerics.check import InputError, fail, shown
+
+TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
+ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
+ANNOTATIONS = ("#group", "#datatype", "#default", "#constant")  # of Influx's annotated CSV
+LINES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
+# A date or seconds, a topic and a payload, as `mosquitto_sub -F "%I %t %p"` and `mosquitto_sub -v` print them.
+LOGGED = re.compile(r"(?:(?P<arrival>\d{4}-\d\d-\d\dT\S+|\d+(?:\.\d+)?) )?(?P<topic>[^\s{}\[\]\",]+) (?P<payload>.*)")
+
+
+class FileMessage(NamedTuple):
+    """Message of a file.
+
+    Attributes:
+        where: its place, for errors.
+        topic: its topic; None for that of its file.
+        content: the message, decoded; its payload as text where it is of a log.
+        arrival: when it arrived, as the file says it; None if it does not.
+        stored: whether the broker had stored it for new subscribers.
+    """
+
+    where: str
+    topic: str | None
+    content: Any
+    arrival: Any
+    stored: bool = False
+
+
+def is_message_file(path: Path) -> bool:
+    """Return whether a file has lines of messages, by its name."""
+    return kind_of(path) in LINES and path.is_file()
+
+
+def message_name(path: Path) -> str:
+    """Return the topic of the messages of a file that name none: its name, without .gz."""
+    return path.name.removesuffix(".gz")
+
+
+def table_has_topics(path: Path) -> bool:
+    """Return whether a table is a log of messages: it has a column `topic`."""
+    kind = kind_of(path)
+    if kind == ".parquet" and path.is_file():
+        return TOPIC in parquet_names(path)
+    return kind == ".csv" and path.is_file() and TOPIC in csv_header(path)
+
+
+def parquet_names(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file; none of a file that is none."""
+    import pyarrow.parquet as pq
+
+    try:
+        return list(pq.ParquetFile(path).schema_arrow.names)
+    except (ValueError, OSError):  # no such file: who reads it says so
+        return []
+
+
+def messages_of(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file, or why one cannot be read, in the order of the file.
+
+    Raises:
+        ValueError: the file cannot be read at all; one line.
+    """
+    kind = kind_of(path)
+    if not path.is_file():
+        raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
+    if kind in LINES:
+        yield from _lines(path)
+        return
+    for where, row in _csv_rows(path) if kind == ".csv" else _parquet_rows(path):
+        yield row if isinstance(row, InputError) else _of_row(where, row)
+
+
+def log_line(text: str) -> tuple[str, str, str | None] | None:
+    """Return topic, payload and arrival of a line that an MQTT client printed; None for any other."""
+    match = LOGGED.fullmatch(text.strip())
+    return None if match is None else (match["topic"], match["payload"], match["arrival"])
+
+
+def of_log(content: object) -> tuple[str, str, Any, bool] | None:
+    """Return topic, payload, arrival and whether it was stored of a message of a log in JSON; None for any other."""
+    if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
+        return None
+    inner = content[PAYLOAD]
+    arrival = next((content[name] for name in ARRIVALS if content.get(name) is not None), None)
+    return content[TOPIC], inner if isinstance(inner, str) else json.dumps(inner), arrival, bool(content.get("retain"))
+
+
+def _of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+    arrival = row.get("arrival")
+    if TOPIC not in row:
+        return FileMessage(where, None, row, arrival)
+    payload = row.get(PAYLOAD) if PAYLOAD in row else row
+    return FileMessage(where, str(row[TOPIC]), payload, arrival)
+
+
+def _lines(path: Path) -> Iterator[FileMessage | InputError]:
+    with opened_text(path) as file:
+        if kind_of(path) == ".json":  # one document, of any number of lines, or one a line
+            text = file.read()
+            try:
+                whole = json.loads(text)
+            except (ValueError, RecursionError):
+                lines = enumerate(text.splitlines(), 1)
+            else:
+                yield from (_of_object(f"{path}, message {n}", item) for n, item in enumerate(_flat(whole), 1))
+                return
+        else:
+            lines = enumerate(file, 1)
+        for number, line in lines:
+            if line.strip():
+                yield _of_line(f"{path}, line {number}", line)
+
+
+def _flat(content: object) -> Iterator[object]:
+    """Yield what is in a list, and in lists of lists."""
+    for item in content if isinstance(content, list) else [content]:
+        yield from _flat(item) if isinstance(item, list) else [item]
+
+
+def _of_line(where: str, line: str) -> FileMessage | InputError:
+    try:
+        return _of_object(where, decoded(line, where))
+    except InputError as error:
+        parts = log_line(line)
+        return error if parts is None else FileMessage(where, *parts)
+
+
+def _of_object(where: str, content: object) -> FileMessage:
+    logged = of_log(content)
+    if logged is None:
+        return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)
+    topic, payload, arrival, stored = logged
+    return FileMessage(where, topic, payload, arrival, stored)
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any] | InputError]]:
+    """Yield the rows from 1, with numbers as numbers and empty cells as None; of annotated CSV each table's."""
+    header: list[str] | None = None
+    with csv_lines(path) as lines:
+        number = 0
+        for line in lines:
+            if line[0].strip() in ANNOTATIONS:
+                header = None
+                continue
+            if header is None:
+                header = [name.strip() for name in line]
+                twice = [name for i, name in enumerate(header) if name and name in header[:i]]
+                if twice:
+                    raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")
+                continue
+            number += 1
+            where = f"{path}, row {number}"
+            if len(line) != len(header):
+                yield where, fail(where, f"{len(header)} cells, one for each column", len(line))
+                continue
+            cells = [(name, cell.strip()) for name, cell in zip(header, line, strict=True)]
+            yield where, {name: cell if name == PAYLOAD else _cell(cell) for name, cell in cells}
+
+
+def _parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the rows from 1; moments are dates of ISO 8601, in UTC where they have no zone."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(path).read()
+    names = table.column_names
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise fail(f"{path}, header", "distinct columns", f"{twice!r} more than once")
+    for i, column in enumerate(table.columns):
+        if pa.types.is_timestamp(column.type):
+            whole = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
+            texts = [None if t is None else _iso(t) for t in whole]
+            table = table.set_column(i, names[i], pa.chunked_array([pa.array(texts, pa.string())]))
+    for number, row in enumerate(table.to_pylist(), 1):
+        yield f"{path}, row {number}", row
+
+
+def _iso(nanoseconds: int) -> str:
+    import numpy as np
+
+    return f"{np.datetime64(nanoseconds, 'ns')}Z"
+
+
+def _cell(cell: str) -> float | int | str | None:
+    """Convert a cell to a number where it is one; whole numbers keep every digit."""
+    return unquoted(cell) if cell else None
+
+
+def payload_of(message: FileMessage) -> object:
+    """Decode the payload of a message of a log.
+
+    Raises:
+        ValueError: no JSON; one line.
+    """
+    if not isinstance(message.content, str):
+        return message.content
+    try:
+        return decoded(message.content, f"{message.where}, {PAYLOAD}")
+    except InputError:
+        raise fail(f"{message.where}, {PAYLOAD!r}", "JSON", shown(message.content)) from None

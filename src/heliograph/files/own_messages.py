@@ -1,0 +1,192 @@
+"""Messages in our own form, in tables and lines: a node, its count, a time, and values, in any order."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.event_table import EventTable
+from heliograph.files.fields import name_of
+from heliograph.files.message_files import FileMessage, parquet_names
+from heliograph.files.sources import Reading
+from heliograph.files.table import csv_header, kind_of
+from heliograph.live.event import INPUTS, OF_STEPS, whole
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail, shown
+from heliograph.numerics.dates import looks_like_date, moment_of
+from heliograph.simulation.network import Network
+
+EXACT = 2**53  # up to here doubles hold every whole number
+NODE, SEQUENCE, TIME, ARRIVAL, VALUES, PLANT = "node", "sequence", "time", "arrival", "values", "plant"
+OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
+
+
+def holds_events(path: str | Path) -> bool:
+    """Return whether a CSV or Parquet file has events instead of rows: it has the columns `node` and `sequence`."""
+    path = Path(path)
+    if not path.is_file() or kind_of(path) not in (".csv", ".parquet"):
+        return False
+    return {NODE, SEQUENCE} <= set(parquet_names(path) if kind_of(path) == ".parquet" else csv_header(path))
+
+
+def is_own(content: object) -> bool:
+    """Return whether a decoded message is in our own form."""
+    return isinstance(content, Mapping) and NODE in content and bool({SEQUENCE, VALUES, INPUTS} & content.keys())
+
+
+class OwnMessages:
+    """Messages in our own form as they are read, to a table of their events.
+
+    Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
+    values: one field for each component, named as the sensor's outputs or the plant's inputs, or `values` with all of
+    the node's numbers, as a list or separated by spaces. What is empty did not arrive. Times are numbers or dates of
+    ISO 8601, all with a time zone or all without. A sequence keeps every digit.
+
+    Args:
+        network: the network that the names belong to.
+        path: the file.
+        ignore_unknown: whether columns that nobody knows are left out.
+    """
+
+    def __init__(self, network: Network, path: Path, ignore_unknown: bool):
+        self.network, self.path, self._ignore = network, path, ignore_unknown
+        self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
+        self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        self.steps = TIME_STEP not in network.inputs
+        self._table: EventTable | None = None
+        self._zero: int | None = None  # that whole numbers are counted from, which doubles could not tell apart
+        self._zoned: bool | None = None
+        self.used, self.refused, self.reasons = 0, 0, list[str]()
+
+    def add(self, message: FileMessage | InputError, strict: bool) -> None:
+        """Append the events of a message; what cannot be read is refused alone.
+
+        Raises:
+            ValueError: columns that lack, or that nobody knows; where reading is strict, a message that cannot be read.
+        """
+        try:
+            if isinstance(message, InputError):
+                raise message
+            self._add(message.where, message.content)
+            self.used += 1
+        except HeaderError:
+            raise
+        except InputError as error:
+            if strict:
+                raise
+            self.refused += 1
+            self.reasons += [str(error)] if len(self.reasons) < 3 else []
+
+    def events(self) -> EventTable:
+        """Return the events.
+
+        Raises:
+            ValueError: none could be read; why the first could not.
+        """
+        if self._table is None:
+            raise InputError(self.reasons[0]) if self.reasons else fail(str(self.path), "at least one row", "none")
+        if self._zero:
+            self._table.notes.append(f"{self.path}: times are counted from {self._zero}")
+        self._table.refused, self._table.reasons = self.refused, self.reasons
+        return self._table
+
+    def _add(self, where: str, row: Mapping[str, Any]) -> None:
+        self._check_columns(where, row)
+        node = row[NODE]
+        if node not in self.components:
+            raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", shown(node))
+        values = _received(row, self.components[node], where)
+        sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
+        time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
+        arrival = time
+        if ARRIVAL in row and (row[ARRIVAL] is not None or "line" not in where):
+            arrival, _ = self._moment(row[ARRIVAL], f"{where}, column {ARRIVAL!r}")
+        plant = "" if row.get(PLANT) is None else name_of(row[PLANT], f"{where}, column {PLANT!r}")
+        if self._table is None:
+            self._table = EventTable(self.network, numbers=not dated)
+        if isinstance(row.get(INPUTS), list) and node != INPUTS:
+            given = _received({VALUES: row[INPUTS]}, self.components[INPUTS], where)
+            self._table.add(Reading(plant, INPUTS, sequence, time, given), arrival)
+        self._table.add(Reading(plant, node, sequence, time, values), arrival)
+
+    def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
+        """Unknown columns are most likely misspelt: refuse them."""
+        known = [*OWN, *(name for names in self.components.values() for name in names)]
+        for name in () if self._ignore else row:
+            if name not in known:
+                listed = ", ".join(dict.fromkeys(known))
+                raise HeaderError(str(fail(f"{self.path}, header", f"only the columns {listed}", repr(name))))
+        for name in (NODE, SEQUENCE, TIME):
+            if name not in row:
+                raise HeaderError(str(fail(f"{self.path}, header", f"a column {name!r}", f"only {', '.join(row)}")))
+
+    def _moment(self, cell: Any, name: str) -> tuple[Any, bool]:
+        """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
+        dated = isinstance(cell, str) and looks_like_date(cell)
+        expected = "a number"
+        if self._table is not None and dated != (not self._table.numbers):
+            expected = "a number, as the times before" if dated else "a date, as the times before"
+            raise fail(name, expected, shown(cell))
+        if not dated:
+            return self._number(cell, name), False
+        if self.steps:
+            raise fail(name, "a step, a whole number from 0", f"{shown(cell)} ({OF_STEPS})")
+        moment, zoned = moment_of(cell, name)
+        self._zoned = zoned if self._zoned is None else self._zoned
+        if zoned != self._zoned:
+            raise fail(name, "a zone with every date or with none", shown(cell))
+        return moment, True
+
+    def _number(self, cell: Any, name: str) -> float:
+        number = _number(cell, name)
+        if isinstance(cell, int):
+            if self._zero is None:
+                self._zero = cell if abs(cell) >= EXACT else 0
+            number = float(cell - self._zero)
+        if self.steps and TIME in name and not (number >= 0 and number.is_integer()):
+            raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
+        return number
+
+
+class HeaderError(InputError):
+    """The columns of a file are not those of events."""
+
+
+def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
+    """Return the values of one event."""
+    if row.get(VALUES) not in (None, ""):
+        cell = row[VALUES]
+        parts = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
+        if len(parts) != len(names):
+            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", shown(cell))
+        from_text = isinstance(cell, str)
+        return np.array([_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
+    return np.array([_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
+
+
+def _whole(cell: Any, name: str) -> int:
+    """Return a count with every digit; a float is accepted if it is an exact integer."""
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
+        return whole(name, int(cell))
+    if not isinstance(cell, int):
+        _number(cell, name)
+    return whole(name, cell)
+
+
+def _number(cell: Any, name: str, empty: bool = False, text: bool = False) -> float:
+    """Return a number; NaN for what may be `empty` and is; a `text` that reads as one is one."""
+    if empty and (cell is None or cell == ""):
+        return np.nan
+    expected = "a number or an empty cell" if empty else "a number"
+    if isinstance(cell, str) and not text:
+        raise fail(name, expected, f"text, {shown(cell)}")
+    try:
+        if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
+        number = float(cell)
+    except (TypeError, ValueError, OverflowError):
+        number = np.inf
+    if np.isinf(number) or (np.isnan(number) and not empty):
+        raise fail(name, expected, "an empty cell" if cell is None else shown(cell))
+    return number
