@@ -1,4 +1,6 @@
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -203,3 +205,83 @@ def test_estimates_in_both_formats(tmp_path):
         "0.7,5.0,nan,6.0,1.0,0.0,0",
     ]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["e.csv", "e.parquet"]
+
+
+WALK = h.Network(
+    h.Plant(lambda x, u: x, lambda u: u[:1, None], [0.0], 1.0, states=["x"], inputs=["dt"]),
+    {"a": h.Node(h.Sensor(lambda x: x, 0.04, outputs=["y"]), h.perfect(), {})},
+)
+
+
+@pytest.mark.parametrize("kind", ["us", "ms", "s", "D"])
+def test_a_date_that_nanoseconds_cannot_say_is_refused(kind):
+    """The year 1 is "not set" for .NET, OPC UA and Parquet; in 64 bits of nanoseconds it would be one of 1754."""
+    table = {"time": np.array(["0001-01-01", "2026-01-01"], f"datetime64[{kind}]"), "y": [1.0, 2.0]}
+    with pytest.raises(
+        ValueError, match=r"column 'time', row 1: expected a date in whole nanoseconds, .* got 0001-01-01"
+    ):
+        h.files.read_recording(table, WALK)
+
+
+def test_parts_of_a_nanosecond_are_refused_and_coarse_dates_are_kept():
+    fine = np.array(["1970-01-02T00:00:00", "1970-01-02T00:00:01"], "datetime64[s]").astype("datetime64[ps]")
+    assert h.files.read_recording({"time": fine, "y": [1, 2]}, WALK).inputs[1, 0] == 1.0
+    with pytest.raises(ValueError, match="row 2: expected a date in whole nanoseconds"):
+        h.files.read_recording({"time": fine + np.array([0, 1]), "y": [1, 2]}, WALK)
+    for times in (["2026-01", "2026-02"], ["2025Q4", "2026Q1"], np.array(["2025", "2026"], "datetime64[Y]")):
+        days = {"2026-01": 31, "2025Q4": 92}.get(str(times[0]), 365)
+        assert h.files.read_recording({"time": times, "y": [1, 2]}, WALK).inputs[1, 0] == days * 86400
+
+
+def test_whole_numbers_keep_every_digit(tmp_path):
+    times = [1_700_000_000_000_000_000, 1_700_000_000_005_000_000, 1_700_000_000_010_000_001]
+    (tmp_path / "ns.csv").write_text("time,y\n" + "".join(f"{t},1\n" for t in times))
+    for table in (tmp_path / "ns.csv", {"time": np.array(times), "y": np.ones(3)}):
+        recording = h.files.read_recording(table, WALK)
+        assert recording.inputs[:, 0].tolist() == [0, 5_000_000, 5_000_001]
+        assert h.run(network_of_walk(), *recording).time.tolist() == times
+
+
+def network_of_walk():
+    """With a filter, so that it runs."""
+    node = WALK.nodes["a"]
+    plant, sensor = WALK.plant, h.Sensor(lambda x: x, 0.04, outputs=["y"])
+    filters = {"f": h.extended_filter(plant, sensor, h.perfect())}
+    return h.Network(plant, {"a": h.Node(sensor, node.channel, filters)})
+
+
+def test_stamps_that_lost_their_digits_are_said(tmp_path):
+    (tmp_path / "six.csv").write_text("time,y\n1.73234e+09,1\n1.73234e+09,2\n1.73234e+09,3\n1.73235e+09,4\n")
+    with pytest.warns(UserWarning, match="column 'time': 3 of 4 rows share their time with another row"):
+        h.files.read_recording(tmp_path / "six.csv", WALK)
+
+
+def test_doubled_columns_are_refused_at_every_door(tmp_path):
+    line = "expected distinct columns, got 'y' more than once"
+    with pytest.raises(ValueError, match=line):
+        h.files.read_recording(pd.DataFrame([[0, 1, 2]], columns=["time", "y", "y"]), WALK)
+    (tmp_path / "rows.csv").write_text("time,y,y\n0,1,2\n")
+    with pytest.raises(ValueError, match=line):
+        h.files.read_recording(tmp_path / "rows.csv", WALK)
+    (tmp_path / "events.csv").write_text("node,sequence,time,y,y\na,0,0,1,2\n")
+    with pytest.raises(ValueError, match=line):
+        h.files.read_messages(tmp_path / "events.csv", WALK)
+    names = ["node", "sequence", "time", "y", "y"]
+    columns = [pa.array(c) for c in (["a"], [0], [0.0], [1.0], [2.0])]
+    pq.write_table(pa.Table.from_arrays(columns, names=names), tmp_path / "events.parquet")
+    with pytest.raises(ValueError, match=line):
+        h.files.read_messages(tmp_path / "events.parquet", WALK)
+
+
+@pytest.mark.parametrize("name", ["a\tb", "a\nb", "y ", " y", "=y", "y (m)"])
+def test_names_of_any_characters_are_read_as_they_were_written(tmp_path, name):
+    network = h.Network(WALK.plant, {"a": h.Node(h.Sensor(lambda x: x, 0.04, outputs=[name]), h.perfect(), {})})
+    recording = h.files.read_recording({"time": [0.0, 1.0], name: [1.0, np.nan]}, network)
+    for kind in ("csv", "parquet"):
+        h.files.write_recording(recording, network, tmp_path / f"r.{kind}")
+        assert h.files.read_recording(tmp_path / f"r.{kind}", network) == recording
+
+
+def test_thousands_and_decimals_are_told_from_dates():
+    with pytest.raises(ValueError, match="column 'y': expected numbers or dates, got '1,120'"):
+        h.files.read_recording({"time": [0.0], "y": ["1,120"]}, WALK)

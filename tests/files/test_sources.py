@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.fields import at, nanoseconds
+from heliograph.files.fields import at, decoded, nanoseconds
 from heliograph.files.sources import Sources, matches
 
 json_field = hg.files.json_field
@@ -170,3 +170,88 @@ def test_a_table_that_does_not_fit_is_one_line(table, line):
 def test_bad_input_is_one_line(arguments):
     with pytest.raises(ValueError, match=r"^json_field, .*: expected"):
         json_field(**({"node": "garden"} | arguments))
+
+
+TWO = hg.Network(PLANT, {"north": NETWORK.nodes["garden"], "south": NETWORK.nodes["garden"]})
+
+
+def test_plant_and_node_come_from_a_topic_or_a_field():
+    table = {
+        "ranging/+": json_field("r", hg.files.Field("anchor_id", {"17": "north"}), "in", plant=hg.files.Level(1)),
+        "+/south/t": json_field("t", hg.files.Level(-2), "out", plant="device"),
+    }
+    sources = Sources(table, TWO)
+    (reading,) = sources.read("ranging/tag7", {"r": 2.0, "anchor_id": 17}, "m")
+    assert (reading.plant, reading.node, reading.values[0]) == ("tag7", "north", 2.0)
+    (reading,) = sources.read("house/south/t", {"t": 3.0, "device": 5}, "m")
+    assert (reading.plant, reading.node, reading.values[1]) == ("5", "south", 3.0)
+    with pytest.raises(ValueError, match="m, node: expected one of north, south, got '3'"):
+        sources.read("ranging/tag7", {"r": 2.0, "anchor_id": 3}, "m")
+
+
+def test_a_wildcard_that_would_merge_sensors_is_refused():
+    """What the line names mends it."""
+    with pytest.raises(ValueError, match=r"'zigbee2mqtt/\+', plant: expected plant=hg.files.Level\(1\)"):
+        Sources({"zigbee2mqtt/+": json_field("t", "garden", "in")}, NETWORK)
+    sources = Sources({"zigbee2mqtt/+": json_field("t", "garden", "in", plant=hg.files.Level(1))}, NETWORK)
+    assert [sources.read(f"zigbee2mqtt/{name}", {"t": 1}, "m")[0].plant for name in "ab"] == ["a", "b"]
+    assert Sources({"zigbee2mqtt/+": json_field("t", hg.files.Level(1), "in")}, TWO).of("zigbee2mqtt/north")
+
+
+@pytest.mark.parametrize(
+    ("where", "used"),
+    [
+        ({"fix": 3}, [False, True]),
+        ({"fix": range(1, 6)}, [True, True]),
+        ({"fix": {3, 4}, "ok": True}, [False, True]),
+    ],
+)
+def test_a_condition_leaves_messages_out_and_counts_them(where, used):
+    sources = Sources({"t": json_field("v", "garden", "in", where=where)}, NETWORK)
+    read = [bool(sources.read("t", {"v": 1, "fix": fix, "ok": fix > 2}, "m")) for fix in (1, 3)]
+    assert read == used and sources.excluded["t"] == used.count(False)
+
+
+def test_a_message_with_a_count_and_without_a_value_measured_nothing():
+    sources = Sources({"t": json_field("v", "garden", "in", time="at", sequence="n")}, NETWORK)
+    readings = [sources.read("t", {"at": 1, **rest}, "m")[0] for rest in ({"n": 4}, {"v": 2.0}, {"n": 5, "v": 3.0})]
+    assert [r.sequence for r in readings] == [4, 0, 5] and not sources.never()
+    np.testing.assert_array_equal([r.values[0] for r in readings], [np.nan, 2.0, 3.0])
+    # Where no message has it, it is misspelt.
+    sources = Sources({"t": json_field("w", "garden", "in", time="at", sequence="n")}, NETWORK)
+    sources.read("t", {"at": 1, "n": 1, "v": 2}, "m")
+    assert "expected a field 'w', got no 'w' in at, n, v" in sources.never()
+    with pytest.raises(ValueError, match="expected a field 'v'"):
+        Sources({"t": json_field("v", "garden", "in", sequence="n")}, NETWORK).read("t", {"at": 1}, "m")
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 2.5])
+def test_the_heading_of_a_quaternion(angle):
+    """Of any length; with a pitch of 0.3 it is still the turn about the vertical."""
+    z = np.array([0, 0, np.sin(angle / 2), np.cos(angle / 2)])
+    y = np.array([0, np.sin(0.15), 0, np.cos(0.15)])
+    x1, y1, z1, w1 = z
+    x2, y2, z2, w2 = y
+    turned = [w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2, w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+              w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2, w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2]  # fmt: skip
+    message = dict(zip("xyzw", (2 * np.array(turned)).tolist(), strict=True))
+    reading = read(json_field(hg.files.Yaw("q"), "garden", "in"), {"q": message})
+    np.testing.assert_allclose(reading.values[0], angle, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('{"v": nan, "w": "nan", "x": [-inf, 1.#QNAN]}', {"v": None, "w": "nan", "x": [None, None]}),
+        ('{"v": -nan(ind), "w": Infinity}', {"v": None, "w": None}),
+        ('{"w": "say \\"nan\\" ", "v": NAN}', {"w": 'say "nan" ', "v": None}),
+    ],
+)
+def test_bare_words_for_no_number_cost_their_field_alone(text, expected):
+    assert decoded(text, "m") == expected
+
+
+@pytest.mark.parametrize("text", ['{"v": 1, "v": 2}', '{"a": {"v": nan, "v": 2}}'])
+def test_a_doubled_field_is_refused(text):
+    with pytest.raises(ValueError, match="m: expected distinct fields, got 'v' more than once"):
+        decoded(text, "m")

@@ -63,3 +63,21 @@ def test_honest_values_beyond_limits_cost_the_claim_what_is_said(c):
     claimed = np.where(outside, p, p - k * s * k).mean()
     excess = 2 * c * norm.pdf(c) * k * s * k
     assert abs(squares.mean() - claimed - excess) < 4 * squares.std() / np.sqrt(x.size)
+
+
+@pytest.mark.parametrize(
+    ("value", "code", "same"),
+    [
+        (float(np.float32(-9999.9)), -9999.9, True),  # as a column of single precision has it
+        (32767 * 0.1, 3276.7, True),  # a whole number that was scaled
+        (32767 * 0.01, 327.67, True),
+        (2147483646.0, 2147483647.0, False),
+        (-9999.8, -9999.9, False),
+        (65534 * 0.1, 6553.5, False),
+        (0.0, 0.0, True),
+        (1e-300, 0.0, False),
+    ],
+)
+def test_a_code_is_equal_in_the_type_in_which_it_came(value, code, same):
+    assert Limits(1, None, code).outside(np.array([value])).tolist() == [same]
+    assert ("is a code" in Limits(1, None, code).why(np.array([value]), ["z"])) == same

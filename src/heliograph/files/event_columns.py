@@ -119,16 +119,22 @@ def judge(
     # In a row of its own an event stands after inputs of its time, then by node and count.
     rank = _ranks(some.time) if joint else _ranks(some.time, some.node, some.sequence)
     name = _ranks(some.time, some.node, some.sequence)
-    first = _first(name)
     base = _base(some, rank, window)
-    late = (rank < base) | ((rank == base) & (first == np.arange(len(kept))))
-    verdicts[kept[late]] = LATE
-    # Of what has one name, the first stays.
-    for i in np.flatnonzero(~late & (first != np.arange(len(kept)))).tolist():
-        same = np.array_equal(values(int(kept[i])), values(int(kept[first[i]])), equal_nan=True)
-        verdicts[kept[i]] = DUPLICATE if same else CONFLICT
-    if joint:
-        _refuse_second_values(events, values, verdicts)
+    # Of what has one name, and of a node's values in a joint row, the first stays.
+    verdicts[kept[rank <= base if joint else rank < base]] = LATE
+    rivals = _ranks(some.time, some.node) if joint else name
+    several: Bool[np.ndarray, " names"] = np.bincount(rivals, minlength=1) > 1
+    held, filled = dict[int, int](), dict[int, np.ndarray]()
+    for i in np.flatnonzero(several[rivals] & (rank >= base)).tolist():
+        k, mine, row = int(kept[i]), int(name[i]), int(rivals[i])
+        there = ~np.isnan(values(k))
+        if mine in held:
+            same = np.array_equal(values(k), values(held[mine]), equal_nan=True)
+            verdicts[k] = DUPLICATE if same else CONFLICT
+        elif joint and verdicts[k] == USED and row in filled and np.any(there & filled[row]):
+            verdicts[k] = CONFLICT
+        elif verdicts[k] == USED:
+            held[mine], filled[row] = k, there | filled.get(row, False)
     return verdicts
 
 
@@ -176,12 +182,6 @@ def _ranks(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     return ranks
 
 
-def _first(name: Int[np.ndarray, " events"]) -> Int[np.ndarray, " events"]:
-    """Return the number of the first event that has the name of each."""
-    _, first, inverse = np.unique(name, return_index=True, return_inverse=True)
-    return np.asarray(first[inverse])
-
-
 def _base(events: Events, rank: Int[np.ndarray, " events"], window: float) -> Int[np.ndarray, " events"]:
     """Return the rank of the newest row that is final when each event comes, -1 for none.
 
@@ -195,19 +195,3 @@ def _base(events: Events, rank: Int[np.ndarray, " events"], window: float) -> In
     newest = np.full(count + 1, -1)
     np.maximum.at(newest, final, rank)
     return np.maximum.accumulate(newest[:count])
-
-
-def _refuse_second_values(
-    events: Events, values: Callable[[int], np.ndarray], verdicts: Int[np.ndarray, " events"]
-) -> None:
-    """Where rows are joint: refuse an event that has a value where its row has one of the same node already."""
-    used = np.flatnonzero(verdicts == USED)
-    row = _ranks(events.time[used], events.node[used])
-    several: Bool[np.ndarray, " rows"] = np.bincount(row, minlength=1) > 1
-    filled = dict[int, np.ndarray]()
-    for i in np.flatnonzero(several[row]).tolist():
-        there, held = ~np.isnan(values(int(used[i]))), filled.get(int(row[i]))
-        if held is not None and np.any(there & held):
-            verdicts[used[i]] = CONFLICT
-        else:
-            filled[int(row[i])] = there if held is None else held | there
