@@ -12,7 +12,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Protocol
 
-from heliograph.files.sources import Source
+from heliograph.files.json_field import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.lanes import Lanes
