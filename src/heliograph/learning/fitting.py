@@ -9,22 +9,21 @@ from typing_extensions import TypeAliasType
 
 from heliograph.learning.description import Build, Description, describe
 from heliograph.learning.identification import Identifiability, identified_by
-from heliograph.learning.intervals import METHODS, Method
+from heliograph.learning.intervals import LEVEL, METHODS, Method
 from heliograph.learning.likelihood.data import gathered
 from heliograph.learning.likelihood.maximise import Maximum
 from heliograph.learning.likelihood.objective import Form, objectives
-from heliograph.learning.likelihood.surface import StoppedError, Surface
+from heliograph.learning.likelihood.search import AWAY, SPREAD, Search
+from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
-from heliograph.numerics.check import check_count, check_seed, fail, shown
+from heliograph.numerics.check import check_count, check_seed, fail, scalar, shown
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
 
-SPREAD = 1.5  # of the starts, in each coordinate that is a logarithm or a logit
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
-INVISIBLE = 0.01  # information of a logarithm below which its number may as well be the limit
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 Progress = TypeAliasType("Progress", Callable[[str], None])
@@ -82,7 +81,7 @@ class Fit:
         """Row for each number and form, the form that counts first, with intervals as `rows("cosines")`."""
         return tuple(row for solution in reversed(self.solutions) for row in solution.rows())
 
-    def rows(self, method: Method = "cosines", form: Form | None = None) -> tuple[Row, ...]:
+    def rows(self, method: Method = "cosines", form: Form | None = None, level: float = LEVEL) -> tuple[Row, ...]:
         """Table of one form with intervals by another method.
 
         Args:
@@ -91,16 +90,23 @@ class Fit:
                 likelihood (numbers that have a coordinate to themselves; the others as "hessian"); "bootstrap" draws
                 blocks of scores.
             form: "linear" or "conditional"; the one that counts unless given.
+            level: probability with which an interval holds the number, 0.95 by default.
+
+        A number whose logarithm (or logit) is known to a factor of e or worse has its interval by "profile" with all
+        methods, down to the end of its domain where the likelihood there is hardly lower.
 
         Raises:
-            ValueError: an unknown method, or a form that was not fitted.
+            ValueError: an unknown method, a level that is not between 0.5 and 1, or a form that was not fitted.
         """
         if method not in METHODS:
             raise fail("method of intervals", f"one of {', '.join(METHODS)}", shown(method))
         known = {solution.form: solution for solution in self.solutions}
         if form is not None and form not in known:
             raise fail("form", f"one of {', '.join(known)}", shown(form))
-        return known[self.best.form if form is None else form].rows(method)
+        probability = scalar("level of intervals", level, 0.5, 1.0)
+        if probability in (0.5, 1.0):
+            raise fail("level of intervals", "a probability between 0.5 and 1", level)
+        return known[self.best.form if form is None else form].rows(method, float(probability))
 
     @property
     def covariance(self) -> Float[np.ndarray, "entries entries"]:
@@ -121,7 +127,7 @@ class Fit:
     def __str__(self) -> str:
         """Table and sentences as text."""
         width = max(len(row.name) for row in self.table)
-        lines = [f"{row.name:{width}}  {_number(row)}  ({row.form})" for row in self.table]
+        lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})  ({row.form})" for row in self.table]
         late = [f"{node}: {delays}" for node, delays in self.delays.items()]
         return "\n".join([*lines, *late, *self.sentences])
 
@@ -179,19 +185,23 @@ def fit(
     data = gathered(description.start, recording, inputs, description.parameters.size, truth)
     # each form's likelihood over the free numbers, and the starts
     surfaces = [Surface(objective, data) for objective in objectives(description, truth is not False)]
-    say: Progress = progress or (lambda line: None)
     points = _starts(surfaces[0], starts, check_seed("seed", seed))
-    stopped, ends, solutions = False, np.zeros(0), []
     identified = identified_by(surfaces[-1], points[0], seed)
-    # climb each form from the best end of the one before
+    # search each form, from the best end of the one before
+    stopped, ends, solutions = False, np.zeros(0), []
     for surface in surfaces:
-        climbed, stopped = _climbed(surface, points, say)
-        order = np.argsort(-np.nan_to_num(climbed.total, nan=-np.inf))
-        ends = climbed.total[order] if not len(ends) else ends
-        solutions.append(_solution(surface, climbed, int(order[0]), identified.ridges, say))
+        search = Search(surface, _progress(surface, progress or (lambda line: None)))
+        try:
+            top = search.run(points, seed)
+        except KeyboardInterrupt:
+            if search.best is None:
+                raise
+            top, stopped = search.best, True
+        ends = ends if len(ends) else search.ends
+        solutions.append(Solution(surface, top, identified.ridges))
         if stopped:
             break
-        points = climbed.x[order[:1]]
+        points = top.x[None]
     return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped, delays)
 
 
@@ -222,30 +232,17 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
         step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
-    # spread: 1.5 of a logarithm or logit, half the size of an unbounded number
-    information = np.diag(first.information[0])
-    spread = np.full(len(start), SPREAD)
-    for entry in parameters.entries:
-        if entry.coordinate is not None and np.isinf([entry.domain.low, entry.domain.high]).all():
-            at = abs(start[entry.coordinate])
-            spread[entry.coordinate] = at / 2 if at else 3 / np.sqrt(max(information[entry.coordinate], 1e-300))
-    points: np.ndarray = start + np.concatenate(
-        [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
-    )
-    # starts at which the recording is impossible move halfway to the given one
-    for _ in range(6):
-        wrong = ~np.isfinite(surface.evaluations(points).total)
-        if not wrong.any():
-            break
-        points[wrong] = (points[wrong] + start) / 2
-    _check_dependence(surface, points, information)
+    # spread: of logarithms and logits a fixed one, of real numbers half their size or some standard errors
+    free, deviation = surface.domains.free, surface.standard_errors(start)
+    far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
+    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
+    points = surface.possible(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
+    _check_dependence(surface, points)
     return points
 
 
-def _check_dependence(surface: Surface, points: np.ndarray, information: np.ndarray) -> None:
+def _check_dependence(surface: Surface, points: np.ndarray) -> None:
     """Check that the likelihood depends on every free number somewhere."""
-    if np.all(information > 0):
-        return
     seen = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
     lost = [name for name, size in zip(names, seen, strict=True) if not size > 0]
@@ -253,83 +250,35 @@ def _check_dependence(surface: Surface, points: np.ndarray, information: np.ndar
         raise fail(f"free number {lost[0]!r}", "one on which the measurements depend", "one on which nothing does")
 
 
-def _climbed(surface: Surface, points: np.ndarray, say: Progress) -> tuple[Maximum, bool]:
-    """Climb to the top, or as far as the user lets it; return the maximum and whether it was stopped."""
+def _progress(surface: Surface, say: Progress) -> Callable[[Maximum], None]:
     form = surface.objective.form
 
     def watch(now: Maximum) -> None:
         best = np.nanmax(now.total)
         say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
 
-    try:
-        return surface.climb(points, np.ones(points.shape, dtype=bool), watch), False
-    except StoppedError as stopped:
-        return stopped.best, True
-
-
-def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: Progress) -> Solution:
-    """Solution at the best of the ends, with numbers at a limit put there and the others climbed again."""
-    x, total, active = maximum.x[lane].copy(), float(maximum.total[lane]), np.ones(maximum.x.shape[1], dtype=bool)
-    converged, steps = bool(maximum.converged[lane]), maximum.steps
-    # a number that the data hardly see goes to its limit if the likelihood does not fall
-    for index in _invisible(surface, x):
-        moved = x.copy()
-        moved[index] = np.inf if x[index] > 0 and _two_sided(surface, index) else -np.inf
-        at_limit = surface.evaluations(moved[None])
-        if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
-            x, active[index] = moved, False
-    # climb again in the other numbers
-    if not active.all():
-        say(f"{surface.objective.form}: again without {int((~active).sum())} at a limit")
-        try:
-            again = surface.climb(x[None], active[None], lambda now: None)
-        except StoppedError as stopped:
-            again = stopped.best
-        x, total, converged = again.x[0], float(again.total[0]), bool(again.converged[0])
-    return Solution(surface, x, total, active, converged, steps, ridges)
-
-
-def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
-    """List the coordinates of bounded numbers whose information is too small to tell them from the limit."""
-    information = np.diag(surface.evaluations(x[None]).information[0])
-    entries = surface.objective.description.parameters.entries
-    return [
-        entry.coordinate
-        for entry in entries
-        if entry.coordinate is not None
-        and np.isfinite([entry.domain.low, entry.domain.high]).any()
-        and information[entry.coordinate] < INVISIBLE
-    ]
-
-
-def _two_sided(surface: Surface, coordinate: int) -> bool:
-    entry = next(e for e in surface.objective.description.parameters.entries if e.coordinate == coordinate)
-    return bool(np.isfinite([entry.domain.low, entry.domain.high]).all())
+    return watch
 
 
 def _of_climb(fitted: Fit) -> list[str]:
     sentences = []
     if fitted.stopped:
         sentences.append("Stopped before the end: this is the best so far.")
-    elif not fitted.converged:
-        sentences.append("The climb did not converge: the estimates are the best points found.")
-    below = fitted.ends[0] - fitted.ends[1:]
-    elsewhere = np.count_nonzero(~(below < ELSEWHERE))
-    if elsewhere and not fitted.stopped:
+    for solution in fitted.solutions:
+        if not solution.converged and not fitted.stopped:
+            why = f"The {solution.form} form did not converge: {solution.top.reason}."
+            sentences.append(f"{why} The estimates are the best point found.")
+    # the best end of a search itself is not lower than the best
+    below = fitted.solutions[0].total - fitted.ends
+    lower = np.count_nonzero(~(below < ELSEWHERE))
+    if lower and not fitted.stopped:
         lost = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
-        sentences.append(
-            f"{elsewhere} of {len(fitted.ends)} starts ended elsewhere, {lost:.3g} or more below the best."
-        )
+        sentences.append(f"Best of {len(below)} starts, of which {lower} ended lower, by {lost:.3g} or more.")
     return sentences
 
 
 def _of_boundaries(best: Solution) -> list[str]:
-    return [
-        f"{row.name}: {row.estimate:.4g}, {'below' if row.high > row.estimate else 'above'} "
-        f"{row.high if row.high > row.estimate else row.low:.3g} (95 %)."
-        for row in best.rows()
-        if row.boundary
-    ]
+    return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 
 def _of_forms(solutions: tuple[Solution, ...]) -> list[str]:
@@ -344,11 +293,3 @@ def _of_forms(solutions: tuple[Solution, ...]) -> list[str]:
                 f"({a.estimate:.4g} and {b.estimate:.4g}), so that the model is in doubt."
             )
     return sentences
-
-
-def _number(row: Row) -> str:
-    if not row.identified:
-        return f"{row.estimate:10.4g}  (not identified)"
-    if row.boundary:
-        return f"{row.estimate:10.4g}  (limit; {row.low:.4g} .. {row.high:.4g})"
-    return f"{row.estimate:10.4g}  ({row.low:.4g} .. {row.high:.4g})"

@@ -98,9 +98,14 @@ def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) 
     return LongRun(hessian, np.inf)
 
 
-def quantile(freedom: float) -> float:
-    """Number of standard errors that a 95 % interval reaches to each side."""
-    return float(scipy.stats.t.ppf((1 + LEVEL) / 2, freedom))
+def quantile(freedom: float, level: float = LEVEL) -> float:
+    """Number of standard errors that an interval reaches to each side."""
+    return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
+
+
+def fall(level: float) -> float:
+    """Nats by which the profile of a likelihood has fallen at the ends of an interval: half a chi-square's quantile."""
+    return float(scipy.stats.chi2.ppf(level, 1)) / 2
 
 
 def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:

@@ -10,9 +10,10 @@ from scipy.optimize import minimize
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
 from heliograph.learning.description import Description
+from heliograph.learning.intervals import LEVEL, fall
 from heliograph.learning.likelihood.data import gathered
 from heliograph.learning.losses.delays import DelaysByNode
-from heliograph.learning.solution import TWO_SIDED, Row
+from heliograph.learning.solution import Row
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -76,7 +77,7 @@ class SenderFit:
     def __str__(self) -> str:
         """The table and the sentences."""
         width = max(len(row.name) for row in self.table)
-        lines = [f"{row.name:{width}}  {row.estimate:10.4g}  ({row.low:.4g} .. {row.high:.4g})" for row in self.table]
+        lines = [f"{row.name:{width}}  {row.value:>10}  ({row.interval})" for row in self.table]
         late = [f"{node}: {delays}" for node, delays in self.delays.items()]
         return "\n".join([*lines, *late, *self.sentences])
 
@@ -168,7 +169,7 @@ def _row(description: Description, likelihood: Likelihood, x: Float[np.ndarray, 
 
     # The profile at a value, searched from where it was highest at the last one, as far as the two are apart.
     def near(value: float) -> bool:
-        (known, rest), least = last, total - TWO_SIDED
+        (known, rest), least = last, total - fall(LEVEL)
         size = float(np.clip(abs(value - known), 10 * NEAR, 0.2))
         rest, top, _ = _highest(lambda other: likelihood(np.insert(other, coordinate, value)), rest, least, size, NEAR)
         last[:] = [value, rest]

@@ -1,22 +1,24 @@
 """Maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.learning.intervals import DRAWS, LEVEL, Method, Scores, block_sums, long_run, quantile, sandwich
+from heliograph.learning.intervals import DRAWS, LEVEL, Method, Scores, block_sums, fall, long_run, quantile, sandwich
 from heliograph.learning.likelihood.objective import Form
-from heliograph.learning.likelihood.surface import REACH, Surface
-from heliograph.learning.likelihood.transforms import link, unlink
+from heliograph.learning.likelihood.search import FURTHER, Top
+from heliograph.learning.likelihood.surface import Surface
+from heliograph.learning.likelihood.transforms import link, unlink, unlink_slope
 from heliograph.learning.parameters import Entry, Parameters
 from heliograph.learning.ridges import Rank, rank_of
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float
 
-ONE_SIDED = 1.3528  # half the 90 % point of chi-square with one degree of freedom: 95 % on one side
-TWO_SIDED = 1.9207  # half its 95 % point
+WIDE = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
+END = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
+REAL_END = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
 ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
 
 
@@ -27,7 +29,7 @@ class Row(NamedTuple):
     Args:
         name: the number's name.
         estimate: the estimate.
-        low: lower end of the 95 % interval; NaN if not identified.
+        low: lower end of the interval (95 % unless another level was asked for); NaN if not identified.
         high: upper end.
         standard_error: standard error of the estimate; NaN at a boundary or if not identified.
         form: "linear" or "conditional".
@@ -44,28 +46,80 @@ class Row(NamedTuple):
     boundary: bool
     identified: bool
 
+    @property
+    def interval(self) -> str:
+        """Interval in words, with two digits of its own width: "0.12 to 0.31", "below 0.3", "not identified"."""
+        if not self.identified:
+            return "not identified"
+        low, high = (rounded(end, self.high - self.low) for end in (self.low, self.high))
+        if self.boundary:
+            return f"below {high}" if self.high > self.estimate else f"above {low}"
+        return f"{low} to {high}"
 
-@dataclass(frozen=True)
+    @property
+    def value(self) -> str:
+        """Estimate in words, with two digits of the interval's width."""
+        return rounded(self.estimate, self.high - self.low)
+
+
+def rounded(value: float, width: float) -> str:
+    """Write a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
+
+    An end that is far smaller than the width keeps two digits of its own.
+    """
+    if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
+        return f"{value:.4g}"
+    digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(width))) + 2
+    return f"{value:.{min(max(digits, 2), 8)}g}"
+
+
+@dataclass(frozen=True, repr=False)
 class Solution:
     """Maximum of the likelihood in one form.
 
     Args:
         surface: the likelihood.
-        x: the maximum on the line (p,).
-        total: log-likelihood there, in nats.
-        active: which coordinates are not at a boundary (p,).
-        converged: true if the climb came to a maximum.
-        steps: steps of the climb.
+        top: where the search ended.
         ridges: number of directions in which the likelihood does not change.
     """
 
     surface: Surface
-    x: Float[np.ndarray, " p"]
-    total: float
-    active: Bool[np.ndarray, " p"]
-    converged: bool
-    steps: int
+    top: Top
     ridges: int
+    _tables: dict[tuple[Method, float], tuple[Row, ...]] = field(default_factory=dict, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """Form, log-likelihood, whether this is a maximum, and the numbers; no data."""
+        numbers = dict(zip([entry.name for entry in self.parameters.entries],
+                           self.parameters.entries_at(self.x).tolist(), strict=True))  # fmt: skip
+        state = "converged" if self.converged else "not converged"
+        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        return f"Solution({self.form}: log-likelihood {self.total:.6g}, {state}; {values})"
+
+    @property
+    def x(self) -> Float[np.ndarray, " p"]:
+        """The maximum on the line (p,); infinite where a number is at the end of its domain."""
+        return self.top.limit
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood there, in nats."""
+        return self.top.total
+
+    @property
+    def active(self) -> Bool[np.ndarray, " p"]:
+        """Which coordinates are not at a boundary (p,)."""
+        return self.top.active
+
+    @property
+    def converged(self) -> bool:
+        """True if the search came to a maximum."""
+        return self.top.converged
+
+    @property
+    def steps(self) -> int:
+        """Steps of the last climb."""
+        return self.top.steps
 
     @property
     def form(self) -> Form:
@@ -80,22 +134,22 @@ class Solution:
     @cached_property
     def scores(self) -> Scores:
         """Scores of each step, by recording, among active coordinates."""
-        score = self.surface.evaluations(self.x[None]).score[0][..., self.active]
+        score = self.surface.evaluations(self.top.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
     def rank(self) -> Rank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
-        return cut(self.surface.evaluations(self.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
+        return cut(self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the identified directions."""
-        observed = self.surface.hessian(self.x, self.active)[np.ix_(self.active, self.active)]
+        observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         reduced = self._reduced(observed)
         if np.linalg.eigvalsh(reduced)[:1].sum() > 0:
             return reduced
-        information = self.surface.evaluations(self.x[None]).information[0]
+        information = self.surface.evaluations(self.top.x[None]).information[0]
         return self._reduced(information[np.ix_(self.active, self.active)])
 
     @property
@@ -115,33 +169,58 @@ class Solution:
         estimate = long_run(method, scores, self.hessian)
         return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
 
-    def rows(self, method: Method = "cosines") -> tuple[Row, ...]:
-        """Table by this form."""
-        covariance, freedom = self.covariance("hessian" if method == "profile" else method)
-        values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.x)[:, self.active]
-        return tuple(
-            self._row(entry, float(value), row, covariance, freedom, method)
-            for entry, value, row in zip(self.parameters.entries, values, slopes, strict=True)
-        )
+    def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
+        """Table by this form, computed at the first call."""
+        key = method, level
+        if key not in self._tables:
+            self._tables[key] = self._new_rows(method, level)
+        return self._tables[key]
 
-    def _row(
-        self, entry: Entry, value: float, slopes: np.ndarray, covariance: np.ndarray, freedom: float, method: Method
-    ) -> Row:
-        if entry.coordinate is not None and not self.active[entry.coordinate]:
-            return self._at_boundary(entry, value)
-        if not self.identifies(slopes):
-            return Row(entry.name, value, np.nan, np.nan, np.nan, self.form, False, False)
-        error = float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
-        center = link(entry.domain, value)
-        if method == "profile" and entry.coordinate is not None:
-            low, high = self._profile(entry.coordinate, error)
-        elif method == "bootstrap":
-            low, high = center + self._drawn(slopes)
-        else:
-            low, high = center + quantile(freedom) * error * np.array([-1.0, 1.0])
-        least, most = sorted(float(unlink(entry.domain, end)) for end in (low, high))
-        width = abs(float(unlink(entry.domain, center + 1e-6) - unlink(entry.domain, center - 1e-6))) / 2e-6
-        return Row(entry.name, value, least, most, error * width, self.form, False, True)
+    def _new_rows(self, method: Method, level: float) -> tuple[Row, ...]:
+        covariance, freedom = self.covariance("hessian" if method == "profile" else method)
+        values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
+        rows = []
+        for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
+            error = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+            if entry.coordinate is not None and not self.active[entry.coordinate]:
+                rows.append(self._at_boundary(entry, float(value), level))
+            elif not self.identifies(slope):
+                rows.append(Row(entry.name, float(value), np.nan, np.nan, np.nan, self.form, False, False))
+            else:
+                ends = self._ends(entry, float(value), slope, error, freedom, method, level)
+                rows.append(self._row(entry, float(value), error, ends))
+        return tuple(rows)
+
+    def _ends(
+        self,
+        entry: Entry,
+        value: float,
+        slopes: np.ndarray,
+        error: float,
+        freedom: float,
+        method: Method,
+        level: float,
+    ) -> tuple[float, float]:
+        """Ends of an interval on the scale where the domain is symmetric.
+
+        A logarithm or a logit that is hardly known has no symmetric interval: it is cut out of the likelihood.
+        """
+        wide = entry.coordinate is not None and self.surface.domains.single[entry.coordinate] and error > WIDE
+        if entry.coordinate is not None and (wide or method == "profile"):
+            first = min(error, WIDE) * np.array([-2.0, 2.0])
+            low, high = self._cut(entry.coordinate, first, fall(level))
+            return low, high
+        center = float(link(entry.domain, value))
+        if method == "bootstrap":
+            low, high = center + self._drawn(slopes, level)
+            return low, high
+        half = quantile(freedom, level) * error
+        return center - half, center + half
+
+    def _row(self, entry: Entry, value: float, error: float, ends: tuple[float, float]) -> Row:
+        least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
+        slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
+        return Row(entry.name, value, least, most, error * slope, self.form, False, True)
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Decide whether the data identify a function of the coordinates with this derivative."""
@@ -149,33 +228,27 @@ class Solution:
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
-    def _drawn(self, slopes: np.ndarray) -> np.ndarray:
+    def _drawn(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Ends of an interval by blocks of scores drawn anew, less the estimate."""
         drawn = np.linalg.solve(self.hessian, block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
-        ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
         return ends
 
-    def _profile(self, coordinate: int, error: float) -> tuple[float, float]:
-        here = self.x[coordinate]
-        low, high = (
-            self.surface.crossing(self.x, self.total, coordinate, here + sign * error * REACH, TWO_SIDED, self.active)
-            for sign in (-1.0, 1.0)
-        )
-        return low, high
+    def _at_boundary(self, entry: Entry, value: float, level: float) -> Row:
+        """Row of a number at the end of its domain: from there to where the profile has fallen so far.
 
-    def _at_boundary(self, entry: Entry, value: float) -> Row:
-        """Row of a number at a limit: from there to where the profile has fallen so far that 95 % are below."""
+        The square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
+        """
         assert entry.coordinate is not None
-        outward = -1.0 if self.x[entry.coordinate] < 0 else 1.0
-        points = np.repeat(self.x[None], 33, axis=0)
-        points[:, entry.coordinate] = reach = -outward * np.linspace(-24.0, 8.0, 33)
-        totals = self.surface.evaluations(points).total
-        fallen = np.flatnonzero(~(totals > self.total - ONE_SIDED))
-        last = int(fallen[0]) if len(fallen) else len(reach) - 1
-        ends = reach[max(last - 1, 0)] + np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 3.0, 5.0]) * -outward
-        end = self.surface.crossing(self.x, self.total, entry.coordinate, ends, ONE_SIDED, self.active)
+        outward = self.top.ends[entry.coordinate]
+        (end,) = self._cut(entry.coordinate, np.array([-outward * FURTHER]), fall(2 * level - 1))
         limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
         return Row(entry.name, value, min(value, limit), max(value, limit), np.nan, self.form, True, True)
+
+    def _cut(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
+        """Where the profile of a coordinate has fallen by `drop`, from distances at which to look first."""
+        furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
+        return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
 
 
 def cut(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:

@@ -13,7 +13,6 @@ from heliograph.disk.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.losses.losses import Losses
-from heliograph.learning.solution import Row
 from heliograph.report.figures import (
     AMBER,
     BLUE,
@@ -29,6 +28,7 @@ from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, P
 
 MOST = 40  # numbers, filters and nodes that are drawn; tables hold all
 BINS = 20
+LOGARITHMIC = 10.0  # times the least of what is shown of a positive number: then its axis is logarithmic
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,10 @@ def _estimates(learned: Learned) -> Figure:
                 axes.plot([e.low, e.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
             axes.plot(e.estimate, -j, "o" if e.identified else "x", color=color, markersize=6)
         axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
+        # a positive number that is known to a factor of ten or worse is shown by its logarithm
+        ends = [row.low, row.high, row.estimate, learned.starts[row.name]]
+        if min(ends) > 0 and max(ends) > LOGARITHMIC * min(ends):
+            axes.set_xscale("log")
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
         axes.set_ylabel(in_figure(row.name), rotation=0, ha="right", va="center")
@@ -185,8 +189,7 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
     starts = learned.starts
     # Start, estimate and interval of each number.
     rows = [
-        [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
-        for row in learned.fit.table
+        [visible(row.name), f"{starts[row.name]:.4g}", row.value, row.interval, row.form] for row in learned.fit.table
     ]
     form = (
         "of the likelihood; the **conditional** one is sharper and counts where there is one, the **linear** one needs "
@@ -205,14 +208,6 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
         "A cross: the data do not determine it.",
     )
     return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
-
-
-def _interval(row: Row) -> str:
-    if not row.identified:
-        return "not determined"
-    if row.boundary:
-        return f"below {row.high:.3g}" if row.high > row.estimate else f"above {row.low:.3g}"
-    return f"{row.low:.4g} to {row.high:.4g}"
 
 
 def _words(learned: Learned) -> list[Points | Text]:

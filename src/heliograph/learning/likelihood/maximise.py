@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the Gauss-Newton information, from several starts side by side."""
+"""Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,37 +7,82 @@ import numpy as np
 
 from heliograph.numerics.types import Bool, Float
 
-MOST_STEPS = 100
-LONGEST = 1.5  # of a step, in each coordinate
-FLAT = 1e-10  # eigenvalue of the scaled information below which nothing is to be gained in a direction
-CLOSE = 1e-15  # twice the likelihood that a full step would gain: 3e-8 standard errors away
+MOST_STEPS = 200
+FIRST_RADIUS = 10.0  # of the trust region, in standard errors
+WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model foretold well, and badly
+FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
+CLOSE = 1e-15  # g' H^-1 g: twice the likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
-NOISE = 1e-13  # of a log-likelihood's own size: its rounding
-SOFTEST, HARDEST = 1e-7, 1e8  # damping that is none, and at which a start is given up
+NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
+AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
+SMALLEST_RADIUS = 1e-12
+SECULAR_STEPS = 20
+LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
+ROUNDING = 1e-14
+LEAST = 1e-150  # information, of which the square is a number
+LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
+INVISIBLE = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
 
 Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Float[np.ndarray, "lanes p p"]]
 Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
 
 
-class Maximum(NamedTuple):
-    """Ends of the climbs: the point of each lane, its likelihood, whether it converged, and the steps taken.
+class Domains(NamedTuple):
+    """Coordinates by which an end of a domain is at infinity.
 
-    Shapes: x (lanes, p), total (lanes,), converged (lanes,).
+    A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
+
+    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
+    """
+
+    low: Bool[np.ndarray, " p"]
+    high: Bool[np.ndarray, " p"]
+    single: Bool[np.ndarray, " p"]
+
+    @staticmethod
+    def unbounded(count: int) -> "Domains":
+        """Plain real numbers."""
+        none = np.zeros(count, dtype=bool)
+        return Domains(none, none, none)
+
+    @property
+    def free(self) -> Bool[np.ndarray, " p"]:
+        """Coordinates that are real numbers, without an end and without a scale of their own."""
+        return np.asarray(~(self.low | self.high))
+
+
+class Maximum(NamedTuple):
+    """Ends of the searches: point, likelihood, whether it converged, what a full step would still gain, and the steps.
+
+    Shapes: x, gradient (lanes, p), total, converged, remaining (lanes,).
     """
 
     x: Float[np.ndarray, "lanes p"]
     total: Float[np.ndarray, " lanes"]
+    gradient: Float[np.ndarray, "lanes p"]
     converged: Bool[np.ndarray, " lanes"]
+    remaining: Float[np.ndarray, " lanes"]
     steps: int
+
+    @property
+    def order(self) -> np.ndarray:
+        """Lanes from the highest likelihood to the lowest."""
+        return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
 
 
 class _State(NamedTuple):
+    """Lanes of a search: B is the model of the Hessian of -l, radius that of the trust region.
+
+    remaining: g' I^-1 g / 2. done: lanes that go no further.
+    """
+
     x: np.ndarray
     total: np.ndarray
     gradient: np.ndarray
     information: np.ndarray
-    damping: np.ndarray
-    growth: np.ndarray
+    model: np.ndarray
+    radius: np.ndarray
+    remaining: np.ndarray
     done: np.ndarray
     converged: np.ndarray
 
@@ -47,77 +92,237 @@ def maximise(
     start: Float[np.ndarray, "lanes p"],
     active: Bool[np.ndarray, "lanes p"] | None = None,
     watch: Callable[[Maximum], None] | None = None,
+    domains: Domains | None = None,
+    close: float = CLOSE,
 ) -> Maximum:
-    """Climb from each start by (I + damping diag I)^-1 s; `active` coordinates move, the others stay.
+    """Search from each start: the step maximises g' p - p' B p / 2 over |D p| <= radius, in units of standard errors.
 
-    A lane has converged when a full step would gain less than rounding sees. `watch` sees the best so far.
+    B is the Gauss-Newton information I, or I corrected by what steps taught of its error (SR1),
+    whichever foretold the last gain better. A step is taken where the likelihood rises by a share of what was
+    foretold; else the radius falls. So the likelihood never falls, and the units of the numbers do not matter.
+
+    A lane has converged when g' I^-1 g, of the step without bounds, is nothing: less than rounding sees. Coordinates
+    whose domain ends where the likelihood still rises, by no more than AT_LIMIT in all, do not count.
+
+    Args:
+        evaluate: likelihood, gradient and information at points.
+        start: points at which to begin (lanes, p).
+        active: coordinates that move, the others stay (lanes, p); all unless given.
+        watch: called with the best so far before each step.
+        domains: what the coordinates are; plain real numbers unless given.
+        close: g' I^-1 g at which a lane has arrived.
+    Source: Moré and Sorensen (1983) for the step; Dennis, Gay and Welsch (1981) for the choice of the model; Conn,
+    Gould and Toint, Trust-Region Methods (2000).
     """
     moving = np.ones(start.shape, dtype=bool) if active is None else active
+    domains = Domains.unbounded(start.shape[1]) if domains is None else domains
     with np.errstate(all="ignore"):
-        state = _begin(evaluate, start, moving)
+        state = _begin(evaluate, start, moving, domains, close)
         for count in range(MOST_STEPS):
-            best = Maximum(state.x, state.total, state.converged, count)
+            best = Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, count)
             if watch is not None:
                 watch(best)
             if state.done.all():
                 return best
-            state = _step(evaluate, state, moving)
-    return Maximum(state.x, state.total, state.converged, MOST_STEPS)
+            state = _step(evaluate, state, moving, domains, close)
+    return Maximum(state.x, state.total, state.gradient, state.converged, state.remaining, MOST_STEPS)
 
 
-def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray) -> _State:
+def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: Domains, close: float) -> _State:
     total, gradient, information = evaluate(start)
-    none = ~np.isfinite(total)
-    damping, growth = np.full(len(start), 1e-2), np.full(len(start), 2.0)
-    state = _State(start.copy(), total, gradient, information, damping, growth, none, np.zeros(len(start), dtype=bool))
-    return _judged(state, moving)
+    impossible = ~_is_sound(total, gradient, information, moving)
+    lanes = len(start)
+    state = _State(
+        start.copy(),
+        total,
+        gradient,
+        information,
+        information,
+        np.full(lanes, FIRST_RADIUS),
+        np.full(lanes, np.inf),
+        impossible,
+        np.zeros(lanes, dtype=bool),
+    )
+    return _judged(state, moving, domains, close)
 
 
-def _judged(state: _State, moving: np.ndarray) -> _State:
-    """Mark the lanes that have arrived: the gain that an undamped step promises is nothing."""
-    whole = steps_of(state.gradient, state.information, np.zeros(len(state.x)), moving)
-    promised = np.sum(np.clip(whole, -LONGEST, LONGEST) * np.nan_to_num(state.gradient), axis=1)
-    stuck = state.damping > HARDEST
-    arrived = ~state.done & (promised < np.where(stuck, NEAR, CLOSE))
-    return state._replace(done=state.done | stuck | arrived, converged=state.converged | arrived)
+def _is_sound(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    pairs = moving[:, :, None] & moving[:, None, :]
+    derivatives = np.all(np.isfinite(gradient) | ~moving, axis=1)
+    return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
-def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
-    step = np.clip(steps_of(state.gradient, state.information, state.damping, moving), -LONGEST, LONGEST)
+def _judged(state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
+    """Mark lanes that have arrived, and those that are stuck because rounding hides what is left to gain."""
+    counting = moving & ~at_limits(state.x, state.gradient, domains)
+    remaining = np.where(state.done, state.remaining, gain_of(state.gradient, state.information, counting) / 2)
+    stuck = state.radius < SMALLEST_RADIUS
+    arrived = ~state.done & (2 * remaining < np.where(stuck, NEAR, close))
+    return state._replace(remaining=remaining, done=state.done | stuck | arrived, converged=state.converged | arrived)
+
+
+def at_limits(x: np.ndarray, gradient: np.ndarray, domains: Domains) -> Bool[np.ndarray, "lanes p"]:
+    """Coordinates on whose way to the end of their domain the likelihood rises, but hardly.
+
+    Where v = exp(x) is small l(0) - l(v) = -v l'(v) = -dl/dx to first order.
+    """
+    outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
+    rise = outward * gradient
+    return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
+
+
+def _step(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: Domains, close: float) -> _State:
     going = ~state.done
-    tried = np.where(going[:, None] & (step != 0), state.x + step, state.x)
-    # a damped step, accepted where the likelihood does not fall
-    total, gradient, information = evaluate(tried)
-    sound = np.isfinite(total) & np.isfinite(gradient).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
+    counting = moving & ~at_limits(state.x, state.gradient, domains)
+    step, length, foretold = trust_region_step(state.gradient, state.information, state.model, state.radius, counting,
+                                               domains.free)  # fmt: skip
+    tried = np.where(going[:, None], state.x + step, state.x)
+    total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
+    # taken where the likelihood rises; where rounding hides that, if the gradient falls or the step crosses a plateau
     gain = total - state.total
-    better = going & sound & (gain >= -NOISE * np.abs(state.total))
-    # damping by the ratio of gain and promise
-    promised = np.sum(step * (state.gradient - np.einsum("lij,lj->li", state.information, step) / 2), axis=1)
-    softer = np.clip(1 - (2 * gain / np.maximum(promised, 1e-300) - 1) ** 3, 1 / 5, 4.0)  # Nielsen's rule
-    harder = np.where(going, np.maximum(state.damping, 1e-3) * state.growth, state.damping)
-    damping = np.where(better, state.damping * softer, harder)
-    pick = better[:, None]
+    sound = going & _is_sound(total, gradient, information, moving)
+    far = length > 0.9 * state.radius
+    hidden = foretold < NOISE * np.abs(state.total)
+    fell = gain_of(gradient, information, counting) < gain_of(state.gradient, state.information, counting)
+    taken = sound & np.where(hidden, (fell | far) & (gain >= -NOISE * np.abs(total)), gain > 1e-4 * foretold)
+    # radius by how well the gain was foretold
+    well = taken & ((gain > 0.75 * foretold) | hidden)
+    badly = going & ~(sound & ((gain > 0.25 * foretold) | (hidden & taken)))
+    wider = np.where(well & far, WIDER * state.radius, state.radius)
+    radius = np.where(badly, NARROWER * np.minimum(length, state.radius), wider)
+    model = _learned(state, domains, step, gradient, information, gain, sound, taken)
+    pick = taken[:, None]
     after = _State(
         np.where(pick, tried, state.x),
-        np.where(better, total, state.total),
+        np.where(taken, total, state.total),
         np.where(pick, gradient, state.gradient),
         np.where(pick[:, None], information, state.information),
-        np.where(damping < SOFTEST, 0.0, damping),
-        np.where(better, 2.0, np.where(going, state.growth * 2, state.growth)),
+        model,
+        radius,
+        state.remaining,
         state.done,
         state.converged,
     )
-    return _judged(after, moving)
+    return _judged(after, moving, domains, close)
 
 
-def steps_of(
-    gradient: np.ndarray, information: np.ndarray, damping: np.ndarray, moving: np.ndarray
-) -> Float[np.ndarray, "lanes p"]:
-    """Steps (I + damping diag I)^-1 s of the coordinates that move; none in directions that are flat."""
-    there = moving & (np.diagonal(information, axis1=1, axis2=2) > 0)
-    unit = np.where(there, 1 / np.sqrt(np.where(there, np.diagonal(information, axis1=1, axis2=2), 1.0)), 0.0)
-    scaled = np.nan_to_num(information * unit[:, :, None] * unit[:, None, :])
+def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
+    """Evaluate the lanes that go on; the others stay as they are."""
+    values = state.total.copy(), state.gradient.copy(), state.information.copy()
+    for known, new in zip(values, evaluate(x[going]), strict=True):
+        known[going] = new
+    return values
+
+
+def _learned(
+    state: _State,
+    domains: Domains,
+    step: np.ndarray,
+    gradient: np.ndarray,
+    information: np.ndarray,
+    gain: np.ndarray,
+    sound: np.ndarray,
+    taken: np.ndarray,
+) -> np.ndarray:
+    """Model of the Hessian at the end of a step: the information, or the last model corrected by the step (SR1)."""
+    # y = B+ p with the change of the gradient y: B+ = B + r r' / r' p, r = y - B p
+    base = np.nan_to_num(state.model)
+    wrong = np.where(sound[:, None], np.nan_to_num(state.gradient - gradient), 0.0) - _times(base, step)
+    diagonal = np.diagonal(state.information, axis1=1, axis2=2)
+    wrong = np.where(domains.free | (diagonal > INVISIBLE), wrong, 0.0)  # elsewhere y is but rounding
+    along = np.sum(wrong * step, axis=1)
+    unit, _ = _units_and_flat(state.information, step != 0)
+    size = np.sqrt(np.sum((wrong * unit) ** 2, axis=1) * np.sum((step / np.where(unit > 0, unit, 1.0)) ** 2, axis=1))
+    clear = sound & (np.abs(along) > 1e-8 * size)
+    secant = base + np.where(
+        clear[:, None, None], wrong[:, :, None] * wrong[:, None, :] / np.where(clear, along, 1.0)[:, None, None], 0.0
+    )
+    # of the two the one that would have foretold this gain
+    slope = np.sum(state.gradient * step, axis=1)
+    by_model = slope - np.sum(step * _times(base, step), axis=1) / 2
+    by_information = slope - np.sum(step * _times(np.nan_to_num(state.information), step), axis=1) / 2
+    now = np.where(taken[:, None, None], information, state.information)
+    believe = sound & (np.abs(gain - by_model) <= np.abs(gain - by_information))
+    return np.where((believe | ~sound)[:, None, None], np.where(sound[:, None, None], secant, base), now)
+
+
+def trust_region_step(
+    gradient: np.ndarray,
+    information: np.ndarray,
+    model: np.ndarray,
+    radius: np.ndarray,
+    moving: np.ndarray,
+    free: np.ndarray,
+) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
+    """Maximiser p of g' p - p' B p / 2 over |D p| <= radius, |D p|, and the gain that B foretells.
+
+    It is (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius: Newton's
+    method for 1 / |D p| = 1 / radius, from below. All in units u of standard errors, in which B is of order 1 and
+    D = max(1, radius u / LONGEST) where a logarithm moves, else 1: matrices scaled by a diagonal are solved as exactly
+    as without. To B is added v v' for each direction v that is not identified, whose gradient is but rounding.
+    """
+    unit, flat = _units_and_flat(information, moving)
+    stays = unit == 0
+    d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
+    g = np.nan_to_num(gradient) * unit
+    b = _scaled(model, unit)
+    sane = np.all(np.abs(b) < LARGEST, axis=(1, 2))  # NaN is not
+    b = np.where(sane[:, None, None], b, _scaled(information, unit))
+    b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
+    # s: none at first, or what makes the matrix positive
+    least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
+    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + 1e-6))
+    for _ in range(SECULAR_STEPS):
+        step = _solved(b, shift, d, g)
+        length = np.linalg.norm(d * step, axis=1)
+        beyond = length > 1.01 * radius
+        if not beyond.any():
+            break
+        slope = np.sum(d * d * step * _solved(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
+        newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
+        shift = np.where(beyond, shift + newton, shift)
+    inside = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
+    step, length = step * inside[:, None], length * inside
+    foretold = np.sum(step * (g - _times(b, step) / 2), axis=1)
+    return step * unit, length, foretold
+
+
+def _solved(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(B + s D^2)^-1 g of each lane."""
+    matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
+    try:
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
+    except np.linalg.LinAlgError:  # a pivot that is exactly 0
+        shifted = matrix + ROUNDING * np.eye(b.shape[1])
+        return np.asarray(np.linalg.solve(shifted, right[..., None])[..., 0])
+
+
+def gain_of(
+    gradient: np.ndarray, information: np.ndarray, counting: Bool[np.ndarray, "lanes p"]
+) -> Float[np.ndarray, " lanes"]:
+    """g' I^-1 g of the coordinates that count, along directions that are identified: squared standard errors."""
+    unit, _ = _units_and_flat(information, counting)
+    scaled = _scaled(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    inverse = np.where(values > FLAT, 1 / (np.where(values > FLAT, values, 1.0) + damping[:, None]), 0.0)
     along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
-    return np.asarray(np.einsum("lij,lj->li", vectors, along * inverse) * unit)
+    return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
+
+
+def _units_and_flat(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard errors of single coordinates, 0 of those that stay, and directions (lanes, p, p) without information."""
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    there = moving & (diagonal > LEAST) & np.isfinite(diagonal)
+    unit = np.where(there, 1 / np.sqrt(np.where(there, diagonal, 1.0)), 0.0)
+    scaled = _scaled(information, unit)
+    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    return unit, np.where(((values <= FLAT)[:, None, :]), vectors, 0.0) * there[:, :, None]
+
+
+def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """U A U with U = diag(unit); 0 for coordinates that stay, whatever A has there."""
+    stays = (unit == 0)[:, :, None] | (unit == 0)[:, None, :]
+    return np.where(stays, 0.0, matrix * unit[:, :, None] * unit[:, None, :])
+
+
+def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return np.asarray(np.einsum("lij,lj->li", matrix, vector))

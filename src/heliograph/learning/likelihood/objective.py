@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from types import FunctionType
 from typing import Literal, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.filters.rows import over_rows
-from heliograph.learning.description import Description
+from heliograph.learning.description import Build, Description
 from heliograph.learning.likelihood.data import Data
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.enlarged import joint_sensor
@@ -115,10 +116,11 @@ class Objective:
         return isinstance(other, Objective) and same(self._parts(), other._parts())
 
     def __hash__(self) -> int:
-        return hash((self.description.build, self.form))
+        return hash((_source(self.description.build)[0], self.form))
 
     def _parts(self) -> tuple[object, ...]:
-        return self.form, self.description, self.description.start
+        description = self.description
+        return self.form, _source(description.build), description.parameters, description.named, description.start
 
     def filter(self, x: Array) -> AbstractFilter:
         """Filter at a point of the line."""
@@ -141,6 +143,14 @@ class Objective:
 
         mean, covariance = over_rows(filter, z, u, claimed)
         return nearest(jnp.asarray(truth), mean, angles) - mean, covariance
+
+
+def _source(build: Build) -> tuple[object, ...]:
+    """What makes a function the same as another: its code and all that it closes over; of another callable itself."""
+    if not isinstance(build, FunctionType):
+        return (build,)
+    cells = [cell.cell_contents for cell in build.__closure__ or ()]
+    return build.__code__, build.__defaults__, build.__kwdefaults__, cells
 
 
 def objectives(network: Description, by_truth: bool = False) -> list[Objective]:

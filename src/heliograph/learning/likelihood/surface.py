@@ -1,28 +1,31 @@
 """Likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.learning.likelihood.data import Data
-from heliograph.learning.likelihood.maximise import Evaluated, Maximum, maximise
+from heliograph.learning.likelihood.maximise import FLAT, Domains, Evaluated, maximise
 from heliograph.learning.likelihood.objective import Evaluation, Objective, at_points
+from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 
 DIFFERENCE = 1e-3  # standard errors over which scores are differenced
-REACH = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.5, 7.0])  # standard errors at which a profile is cut first
-REFINEMENTS = 2
+CUTS = 40  # of a profile at most
+EXACT = 1e-3  # of the root of a fall
+ENOUGH = 1e-6  # nats that may remain to be gained on a profile
+HALVINGS = 8  # of the way to a possible point
+TINY = 1e-300
 
-Watch = Callable[[Maximum], None]
 
+class Curvature(NamedTuple):
+    """Least eigenvalue of the Hessian of -l in standard errors, its direction (p,), and g' |H|^-1 g / 2."""
 
-class StoppedError(Exception):
-    """Interruption of a climb, with the best so far."""
-
-    def __init__(self, best: Maximum):
-        super().__init__()
-        self.best = best
+    least: float
+    direction: Float[np.ndarray, " p"]
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,14 @@ class Surface:
     objective: Objective
     data: Data
     _last: list[tuple[np.ndarray, Evaluation]] = field(default_factory=list, repr=False, compare=False)
+
+    @cached_property
+    def domains(self) -> Domains:
+        """Which coordinates are logarithms and logits, and at which side their domains end."""
+        every = self.objective.description.parameters.every
+        low, high = (np.concatenate(column) for column in zip(*map(_ends_at_infinity, every), strict=True))
+        single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
+        return Domains(low, high, single & (low | high))
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Evaluation at points."""
@@ -43,27 +54,6 @@ class Surface:
         """Likelihood, gradient and information at points."""
         evaluation = self.evaluations(x)
         return evaluation.total, evaluation.gradient, evaluation.information
-
-    def climb(
-        self, start: Float[np.ndarray, "points p"], active: Bool[np.ndarray, "points p"], watch: Watch
-    ) -> Maximum:
-        """Climb to the top from each start.
-
-        Raises:
-            StoppedError: with the best so far, where the user interrupts.
-        """
-        best: list[Maximum] = []
-
-        def seen(now: Maximum) -> None:
-            best[:] = [now]
-            watch(now)
-
-        try:
-            return maximise(self.evaluate, start, active, seen)
-        except KeyboardInterrupt:
-            if not best:
-                raise
-            raise StoppedError(best[0]) from None
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
         """Hessian of -l by central differences of the scores of active coordinates; the information for the others."""
@@ -82,38 +72,100 @@ class Surface:
         hessian[np.ix_(moving, moving)] = (block + block.T) / 2
         return hessian
 
-    def crossing(
+    def standard_errors(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Standard error of each number at a point, were the others known; infinite if the data say nothing of it."""
+        information: np.ndarray = self.evaluations(x[None]).information[0]
+        seen = np.diag(information)
+        return np.where(seen > 0, 1 / np.sqrt(np.where(seen > 0, seen, 1.0)), np.inf)
+
+    def possible(
+        self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
+    ) -> Float[np.ndarray, "points p"]:
+        """Points, moved halfway to a possible one, again and again, where the likelihood is not finite."""
+        points = points.copy()
+        for _ in range(HALVINGS):
+            wrong = ~np.isfinite(self.evaluations(points).total)
+            if not wrong.any():
+                break
+            points[wrong] = (points[wrong] + near) / 2
+        return points
+
+    def curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
+        """Curvature of -l along the directions that are identified, in standard errors, at a point (p,)."""
+        evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
+        information = evaluation.information[0][np.ix_(places, places)]
+        gradient = evaluation.gradient[0][places]
+        unit = np.where(np.diag(information) > 0, 1 / np.sqrt(np.maximum(np.diag(information), TINY)), 0.0)
+        seen, directions = np.linalg.eigh(information * unit[:, None] * unit)
+        basis = unit[:, None] * directions[:, seen > FLAT]
+        if not basis.size:
+            return Curvature(np.inf, np.zeros(len(x)), 0.0)
+        observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
+        if not np.isfinite(observed).all():
+            return Curvature(np.inf, np.zeros(len(x)), np.inf)
+        values, vectors = np.linalg.eigh(observed)
+        direction = np.zeros(len(x))
+        direction[places] = basis @ vectors[:, 0]
+        slopes = vectors.T @ basis.T @ gradient
+        gain = float(np.sum(slopes**2 / np.maximum(np.abs(values), FLAT)) / 2)
+        return Curvature(float(values[0]), direction, gain)
+
+    def crossings(
         self,
         x: Float[np.ndarray, " p"],
         top: float,
         coordinate: int,
-        reach: Float[np.ndarray, " points"],
+        first: Float[np.ndarray, " lanes"],
+        furthest: float,
         drop: float,
         active: Bool[np.ndarray, " p"],
-    ) -> float:
+    ) -> Float[np.ndarray, " lanes"]:
         """Find where the likelihood, its other active coordinates at their best, has fallen by `drop` below `top`.
 
-        `reach`: values of the coordinate, away from its best, to begin with. Infinite where it has not fallen there.
+        Newton's method for h = sqrt(2 (top - l)), which is linear where l is quadratic, between what is known to be
+        inside and outside; dl/dx of the profile is the score of the coordinate alone.
+
+        Args:
+            x: the maximum (p,).
+            top: the likelihood there.
+            coordinate: the one that is cut.
+            first: signed distances at which to begin, to either side.
+            furthest: distance at which a likelihood that has not fallen never does: then the end is infinite.
+            drop: fall at the ends.
+            active: coordinates that are inside their domains (p,).
         """
-        others = active.copy()
-        others[coordinate] = False
-        inside, outside = x[coordinate], np.nan
-        low = 0.0
-        # profile at a few values, then again between the two around the crossing
-        for _ in range(1 + REFINEMENTS):
-            start = np.repeat(x[None], len(reach), axis=0)
-            start[:, coordinate] = reach
-            total = maximise(self.evaluate, start, np.repeat(others[None], len(reach), axis=0)).total
-            fallen = np.sqrt(np.maximum(2 * (top - np.where(np.isfinite(total), total, -np.inf)), 0.0))
-            beyond = np.flatnonzero(fallen >= np.sqrt(2 * drop))
-            if not len(beyond):
-                return float(np.sign(reach[-1] - reach[0]) * np.inf)
-            at = int(beyond[0])
-            if at > 0:
-                inside, low = reach[at - 1], fallen[at - 1]
-            outside, high = reach[at], fallen[at]
-            reach = np.linspace(inside, outside, len(reach) + 1)[1:]
-        # linear in the root of the fall
-        if not np.isfinite(high):
-            return float(outside)
-        return float(inside + (outside - inside) * (np.sqrt(2 * drop) - low) / (high - low))
+        others = active & (np.arange(len(x)) != coordinate)
+        moving, points = np.repeat(others[None], len(first), axis=0), np.repeat(x[None], len(first), axis=0)
+        side, target, at = np.sign(first), np.sqrt(2 * drop), np.abs(first)
+        inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)
+        for _ in range(CUTS):
+            points[:, coordinate] = x[coordinate] + side * at
+            climbed = maximise(self.evaluate, points, moving, None, self.domains, ENOUGH)
+            with np.errstate(all="ignore"):
+                fallen = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
+                outwards = at + (target - fallen) * fallen / (-side * climbed.gradient[:, coordinate])
+            there = np.abs(fallen - target) < EXACT * target
+            beyond = fallen > target
+            inside, outside = np.where(beyond, inside, at), np.where(beyond, at, outside)
+            points = np.where(beyond[:, None], points, climbed.x)
+            never = ~beyond & (at >= furthest)
+            done = there | never | (outside - inside < EXACT * EXACT * outside)
+            if done.all():
+                return np.asarray(x[coordinate] + side * np.where(never & ~there, np.inf, at))
+            # within the bracket; where nothing is outside yet, at most three times as far
+            most = np.minimum(np.where(np.isfinite(outside), outside, 3 * at), furthest)
+            sound = np.isfinite(outwards) & (outwards > inside) & (outwards < most)
+            middle = np.where(np.isfinite(outside), (inside + most) / 2, most)
+            at = np.where(done, at, np.where(sound, outwards, middle))
+        return np.asarray(x[coordinate] + side * at)
+
+
+def _ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " size"], Bool[np.ndarray, " size"]]:
+    """Coordinates of a number that are at an end of its domain at minus infinity, and at infinity."""
+    domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
+    if domain.kind == "simplex":
+        return ~none, ~none
+    if domain.kind == "covariance":
+        return np.eye(len(parameter.start), dtype=bool)[np.tril_indices(len(parameter.start))], none
+    sides = np.isfinite([domain.low, domain.high])
+    return none | sides.any(), none | sides.all()

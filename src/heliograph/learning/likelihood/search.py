@@ -1,0 +1,184 @@
+"""Search for the maximum of a likelihood: climbs from several starts, ends of domains, and a proof by the Hessian."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.learning.likelihood.maximise import MOST_STEPS, NEAR, Maximum, maximise
+from heliograph.learning.likelihood.surface import Surface
+from heliograph.numerics.types import Bool, Float
+
+HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
+SAME = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
+SPREAD = 3.0  # of starts, in each coordinate that is a logarithm or a logit
+AWAY = 10.0  # standard errors of starts from a maximum, in each real number
+FURTHER = 5.0  # from where a number is hardly seen to where it counts as at the end
+ROUNDS = 6  # of climbs, ends of domains, and proofs
+INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
+EXACTLY = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
+SEEN = 2.0  # nats by which a likelihood has fallen where a number is seen
+SADDLE = -1e-3  # curvature in units of standard errors below which a point is no maximum
+
+Watch = Callable[[Maximum], None]
+
+
+class Top(NamedTuple):
+    """Where a search ended.
+
+    Args:
+        x: the point on the line (p,); a number at the end of its domain is so near that nothing sees the difference.
+        ends: at which end of its domain a number is: -1 or 1, where that is at minus infinity or infinity, else 0 (p,).
+        total: log-likelihood there.
+        converged: whether this is a maximum, by the Hessian.
+        reason: why not, in words; "" of a maximum.
+        steps: steps of the last climb.
+    """
+
+    x: Float[np.ndarray, " p"]
+    ends: Float[np.ndarray, " p"]
+    total: float
+    converged: bool
+    reason: str
+    steps: int
+
+    @property
+    def active(self) -> Bool[np.ndarray, " p"]:
+        """Coordinates that are inside their domains (p,)."""
+        return np.asarray(self.ends == 0)
+
+    @property
+    def limit(self) -> Float[np.ndarray, " p"]:
+        """The point with infinite coordinates for numbers at the ends of their domains (p,)."""
+        return np.where(self.ends == 0, self.x, np.copysign(np.inf, self.ends))
+
+
+@dataclass
+class Search:
+    """Search for the maximum over a surface, which holds the best point so far at any moment.
+
+    Args:
+        surface: the likelihood.
+        watch: called at each step of a climb.
+        best: the best point so far, none before the first climb began.
+        ends: log-likelihood at which the climb from each start ended, best first.
+    """
+
+    surface: Surface
+    watch: Watch
+    best: Top | None = None
+    ends: Float[np.ndarray, " starts"] = field(default_factory=lambda: np.zeros(0))
+
+    def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> Top:
+        """Climb from all starts, then from as many others around the best, less one; prove the highest end.
+
+        Args:
+            starts: where to begin (starts, p); from a single one there is a single climb.
+            seed: seed of the second round.
+        """
+        none = np.zeros(starts.shape[1])
+        climbed = self._climb(starts, none)
+        top = self._proved(climbed)
+        ends = climbed.total
+        if len(starts) > 1:
+            climbed = self._climb(self._around(top, len(starts) - 1, seed), none)
+            ends = np.concatenate([ends, climbed.total])
+            if climbed.total.max() > top.total + SAME:
+                top = self._proved(climbed)
+        self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
+        return top
+
+    def _proved(self, climbed: Maximum) -> Top:
+        """Put numbers at the ends of their domains and climb again until the best end is a maximum.
+
+        A maximum: g' H^-1 g is nothing with the Hessian H of -l, which is not indefinite, among the numbers inside
+        their domains; at an end the likelihood does not rise inwards.
+        """
+        none = np.zeros(climbed.x.shape[1])
+        top = _top(climbed, none)
+        for _ in range(ROUNDS):
+            top = self._at_limits(top)
+            again, reason = self._elsewhere(top) if top.converged else (None, self._why_not(top))
+            if again is None:
+                return top._replace(converged=not reason, reason=reason)
+            top = _top(self._climb(again, none), none)
+        return top._replace(converged=False, reason="the search went to and fro between two points")
+
+    def _around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "count p"]:
+        """Points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away."""
+        deviation = self.surface.standard_errors(top.x)
+        spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
+        drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count, len(top.x)))
+        centre = top.x.copy()
+        for index in np.flatnonzero(top.ends):
+            rise = self._inwards(top, int(index))[1]
+            centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
+        return self.surface.possible(centre + drawn * spread, top.x)
+
+    def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
+        def seen(now: Maximum) -> None:
+            here = _top(now, ends)
+            if self.best is None or not here.total < self.best.total:
+                self.best = here._replace(converged=False, reason="")
+            self.watch(now)
+
+        moving = np.repeat((ends == 0)[None], len(starts), axis=0)
+        return maximise(self.surface.evaluate, starts, moving, seen, self.surface.domains)
+
+    def _at_limits(self, top: Top) -> Top:
+        """Put numbers that the data hardly see at the end of their domains, where the likelihood is the same."""
+        domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
+        information = np.diag(self.surface.evaluations(x[None]).information[0])
+        for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
+            moved, side = x.copy(), 1.0 if domains.high[index] and x[index] > 0 else -1.0
+            moved[index] += side * FURTHER
+            at = self.surface.evaluations(moved[None])
+            if np.isfinite(at.gradient).all() and np.isfinite(at.information).all() and at.total[0] > total - SAME:
+                x, total, ends[index] = moved, float(at.total[0]), side
+        if np.array_equal(ends, top.ends):
+            return top
+        return _top(self._climb(x[None], ends), ends)
+
+    def _elsewhere(self, top: Top) -> tuple[np.ndarray | None, str]:
+        """Points from which to climb again where the end of a climb is no maximum, or why it is none and nothing helps.
+
+        Along each number at the end of its domain the likelihood is looked at on the way back inside.
+        """
+        for index in np.flatnonzero(top.ends):
+            points, rise = self._inwards(top, int(index))
+            if rise.max() > SAME:
+                return points[[int(rise.argmax())]], ""
+        curvature = self.surface.curvature(top.x, top.active)
+        if curvature.least < SADDLE:
+            return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""
+        if not curvature.gain < NEAR:
+            return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
+        return None, ""
+
+    def _why_not(self, top: Top) -> str:
+        """Why a climb did not arrive: of data that the network reproduces exactly the likelihood has no maximum."""
+        z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
+        size = np.log(np.nanmax(np.abs(z)))
+        if top.total / np.count_nonzero(~np.isnan(z)) + size > EXACTLY:
+            return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
+        return top.reason
+
+    def _inwards(self, top: Top, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points on the way from the end of a domain inwards (INWARDS, p), and how much higher the likelihood is."""
+        points = np.repeat(top.x[None], len(INWARDS), axis=0)
+        points[:, index] -= top.ends[index] * INWARDS
+        return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
+
+
+def _top(climbed: Maximum, ends: np.ndarray) -> Top:
+    lane = int(climbed.order[0])
+    converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
+    reason = "" if converged else _why(remaining)
+    return Top(climbed.x[lane].copy(), ends, float(climbed.total[lane]), converged, reason, climbed.steps)
+
+
+def _why(remaining: float) -> str:
+    if not np.isfinite(remaining):
+        return "the likelihood has no finite derivatives there"
+    return f"after {MOST_STEPS} steps a further one promises {remaining:.2g} of log-likelihood"
