@@ -3,6 +3,7 @@
 import os
 import pwd
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -65,17 +66,27 @@ class Postgres:
         self.folder = Path(tempfile.mkdtemp(prefix="heliograph-pg-", dir=reachable_by_all()))
         if who := user():
             shutil.chown(self.folder, who["user"], who["group"])
-        data, log = self.folder / "data", self.folder / "log"
+        data = self.folder / "data"
+        self._command = [folder / "postgres", "-D", data, "-k", self.folder, *SPARE]
         made = subprocess.run(
             [folder / "initdb", "-D", data, "-A", "trust", "-U", "me", "-E", "UTF8", "--locale=C", "-N"],
             capture_output=True, text=True, cwd=self.folder, **who,
         )  # fmt: skip
         assert made.returncode == 0, made.stderr
-        with log.open("wb") as errors:
-            command = [folder / "postgres", "-D", data, "-k", self.folder, *SPARE]
-            self.process = subprocess.Popen(command, stdout=errors, stderr=errors, cwd=self.folder, **who)
         self.numbers = count(1)
+        self.start()
+
+    def start(self) -> None:
+        """Start, and wait until it answers."""
+        log = self.folder / "log"
+        with log.open("ab") as errors:
+            self.process = subprocess.Popen(self._command, stdout=errors, stderr=errors, cwd=self.folder, **user())
         self.wait(log)
+
+    def stop(self) -> None:
+        """End all connections, and the server."""
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(10)
 
     def wait(self, log: Path) -> None:
         """Until it answers."""

@@ -2,8 +2,7 @@
 
 import asyncio
 import contextlib
-import os
-import socket
+import logging
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -22,8 +21,9 @@ from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport, word
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.loop import Takes, serve_until, signals
+from heliograph.serving.patience import Patient, patiently
 from heliograph.serving.service import Service
-from heliograph.serving.storage.store_protocol import Damage, InMemoryStore, StoreProtocol, identity
+from heliograph.serving.storage.store_protocol import AwayError, Damage, InMemoryStore, StoreProtocol, identity
 from heliograph.simulation.centres.node_filter import node_network
 from heliograph.simulation.network import Network
 
@@ -101,7 +101,8 @@ async def keep_sharing(leases: Leased, serve: Serve) -> None:
                     await asyncio.wait_for(stop.wait(), leases.term / 5)
         finally:
             await asyncio.gather(*[part.end() for part in parts.values()])
-            await asyncio.to_thread(leases.leave)
+            with contextlib.suppress(AwayError):  # they end by themselves
+                await asyncio.to_thread(leases.leave)
 
 
 async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None:
@@ -115,7 +116,11 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
             except TakenOverError as error:
                 LOG.warning("%s", error)
     # Stop those that are no longer leased, then release them; start the new ones.
-    expected = await asyncio.to_thread(leases.renew)
+    try:
+        expected = await asyncio.to_thread(leases.renew)
+    except AwayError as error:  # nobody else has them either
+        LOG.warning("%s; trying again", error)
+        return
     gone = [number for number in parts if number not in expected]
     await asyncio.gather(*[parts[number].end() for number in gone])
     for number in gone:
@@ -240,6 +245,7 @@ def name_of(network: str) -> str:
 
 async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
+    _log_to_stderr()
     async with _watched(settings) as look:
         lanes = Lanes(settings.network)
         if lanes.uneven:
@@ -249,6 +255,15 @@ async def run(settings: ServiceSettings) -> None:
             await _alone(settings, lanes, look)
         else:
             await _shared(settings, lanes, look, settings.parts)
+
+
+def _log_to_stderr() -> None:
+    """Say what happens to connections on the standard error, unless the program has said where its log goes."""
+    if not LOG.handlers and not logging.getLogger().handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("heliograph: %(message)s"))
+        LOG.addHandler(handler)
+        LOG.setLevel(logging.INFO)
 
 
 Look = Callable[[Service], Takes]
@@ -270,21 +285,22 @@ async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
 
 async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """Serve all messages in one process."""
-    # The store first, whose state the service goes on from.
     stop = asyncio.Event()
     reads = None if settings.sources is None else Translator(settings.sources, settings.network)
     step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(lanes, settings.options._replace(step=step))
-    store = _open_store(settings, fleet)
-    resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every)
-    service.resume()
-    try:
-        with signals(stop):
+    with signals(stop), contextlib.ExitStack() as owning:
+        # The store first, whose state the service goes on from.
+        store = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet, owning), stop)
+        resumed, service = store.count() > 0, Service(fleet, store, _say, settings.every)
+        try:
+            service.resume()
             broker = settings.broker
             transport = Pipe(translator=reads) if broker is None else connected(broker, translator=reads)
-            await serve_until(stop, look(service), transport, None if step is None else max(step, SHORTEST))
-    finally:
-        store.close()
+            patience = None if step is None else max(step, SHORTEST)
+            await serve_until(stop, Patient(look(service), stop), transport, patience)
+        finally:
+            store.close()
     # What was not used, in words.
     for left in [] if reads is None else reads.left_out():
         _say(left)
@@ -293,10 +309,17 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
 
 
-def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
-    """Open the store, with the snapshot and the plants to begin anew, and report its state."""
+def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.ExitStack | None = None) -> StoreProtocol:
+    """Open the store, with the snapshot and the plants to begin anew, and report its state.
+
+    `owning` holds it for this service alone; None where processes share it.
+    """
     if settings.store is None:
         return InMemoryStore()
+    if owning is not None:
+        from heliograph.serving.storage.owner import owned
+
+        owning.enter_context(owned(settings.store, settings.process))
     from heliograph.serving.storage.carrier import Carrier
     from heliograph.serving.storage.store import Store
 
@@ -332,13 +355,14 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
     """One process of several: the parts that it leases."""
     from heliograph.serving.storage.database import engine_at
     from heliograph.serving.storage.leases import Leases
+    from heliograph.serving.storage.owner import name_of_process
     from heliograph.serving.storage.store import Store
 
     store_name, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked
     fleet = Fleet(lanes, settings.options)
     # Check the store once, before any part is served.
-    first = _open_store(settings, fleet)
+    first = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet), asyncio.Event())
     assert isinstance(first, Store)  # as Wanted checked
     first.close()
     mine = identity(fleet)
@@ -348,12 +372,12 @@ async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: in
         store = Store(store_name, mine, f"part {number} of {parts}", opened=first)
         try:
             service = look(Service(Fleet(lanes, settings.options), store, _say))
-            await serve_until(stop, service, connected(broker, Part(number, parts)))
+            await serve_until(stop, Patient(service, stop), connected(broker, Part(number, parts)))
         finally:
             store.close()
 
     # Lease parts under a name that is unique to this process.
-    name = settings.process or f"{socket.gethostname()} {os.getpid()}"
+    name = settings.process or name_of_process()
     engine = engine_at(store_name)
     try:
         await keep_sharing(Leases(engine, name, parts), serve)

@@ -178,7 +178,8 @@ class Service:
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
-        return self.store.unpublished()
+        known = self._published or 0  # which the next commit records
+        return [output for output in self.store.unpublished() if (output.number or 0) > known]
 
     def published(self, outputs: Sequence[Output]) -> None:
         """Note that these outputs were published; the next commit records it."""

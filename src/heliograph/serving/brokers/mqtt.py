@@ -1,6 +1,7 @@
 """Messages through MQTT: each is acknowledged after the commit; the broker keeps a session while nobody reads."""
 
 import asyncio
+import sys
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
 from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, topic_of
+from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, topic_of, why
 from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -84,7 +85,7 @@ class _Connection:
     def failed(self, client: Client, data: object) -> None:
         """Report that nobody answers there, or nobody who is trusted."""
         if self.open:
-            LOG.warning("%s: no connection; trying again", self.address)
+            LOG.warning("%s: %s; trying again", self.address, why(sys.exc_info()[1]))  # called where it was caught
 
     def close(self) -> None:
         with self.room:
@@ -150,6 +151,7 @@ class _Reader(_Connection):
         self._connection += 1
         if not code.is_failure:
             topics = [] if self._translator is None else self._translator.sources.topics
+            LOG.info("%s: connected", self.address)
             client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._below}", *topics)])
 
     def disconnected(

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats.errors import Error, TimeoutError
+from nats.errors import Error, NoServersError, TimeoutError
 from nats.js import JetStreamContext
 from nats.js.api import (
     AckPolicy,
@@ -26,6 +26,7 @@ from heliograph.numerics.check import fail
 from heliograph.serving.brokers.translator import Translator
 from heliograph.serving.brokers.transport import (
     FIRST,
+    LOG,
     WHOLE,
     Batch,
     Part,
@@ -155,9 +156,14 @@ class Nats:
             # Connect without the client's reconnection, after which messages would arrive out of order.
             await self.close()
             self._client, self._server, self._reader = Client(), None, None
-            await self._client.connect(
+            failures = list[Exception]()  # of which the client raises none
+
+            async def failed(error: Exception) -> None:
+                failures.append(error)
+
+            connecting = self._client.connect(
                 f"nats://{self.address.host}:{self.address.port}",
-                error_cb=_silent,
+                error_cb=failed,
                 user=self.address.user if self.address.password else None,
                 password=self.address.password,
                 token=None if self.address.password else self.address.user,
@@ -166,6 +172,11 @@ class Nats:
                 connect_timeout=5,
                 reconnect_time_wait=FIRST,  # type: ignore[arg-type]  # between attempts at a server that is away
             )
+            try:
+                await connecting
+            except NoServersError as error:
+                raise (failures[0] if failures and isinstance(failures[0], AWAY) else error) from None
+            LOG.info("%s: connected", self.address)
             # The stream of outputs that are published exactly once.
             server = self._client.jetstream(timeout=ANSWER)
             subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
@@ -237,7 +248,3 @@ async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInf
         return await server.update_stream(info.config.evolve(subjects=expected.subjects))
     except NotFoundError:
         return await server.add_stream(expected)
-
-
-async def _silent(_: Exception) -> None:
-    """Ignore errors of the client's background tasks: they are raised again where we await them."""

@@ -9,6 +9,8 @@ computes itself; a sender to MQTT writes the part into the topic.
 import asyncio
 import logging
 import random
+import socket
+import ssl
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
 from urllib.parse import quote
@@ -76,6 +78,21 @@ def still_needed() -> None:
         raise asyncio.CancelledError
 
 
+def why(error: BaseException | None) -> str:
+    """Return in words why there is no connection; no part of it is a password."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not trusted: {error.verify_message}"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS failed: {(error.reason or 'unknown reason').replace('_', ' ').lower()}"
+    if isinstance(error, socket.gaierror):
+        return "no such host"
+    if isinstance(error, TimeoutError):
+        return "no answer"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
+    return "no connection" if error is None else type(error).__name__
+
+
 class Retry:
     """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
 
@@ -86,7 +103,7 @@ class Retry:
         """Log the failure, and wait before the next attempt."""
         still_needed()
         wait = self._wait * random.uniform(0.5, 1.0)
-        LOG.warning("%s: %s; trying again in %.1f s", self.what, type(error).__name__, wait)
+        LOG.warning("%s: %s; trying again in %.1f s", self.what, why(error), wait)
         self._wait = min(2 * self._wait, LONGEST)
         await asyncio.sleep(wait)
 

@@ -1,14 +1,16 @@
 """The database of a store: SQLite at a path or PostgreSQL at a URL, and how transactions begin and end there."""
 
+import sqlite3
 from typing import Any
 
 from sqlalchemy import Connection, create_engine, event
 from sqlalchemy.engine import URL, Engine, make_url
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 
 from heliograph.numerics.check import fail, text
 
 PAGES = "page_size=16384", "cache_size=-16384"  # bytes, of a new database; kB of pages in memory, as large commits have
+PASSING = "starting up", "shutting down", "terminating connection", "recovery mode", "too many clients"
 PLACE = "a file, or a URL as postgresql://host/database"
 
 
@@ -41,6 +43,19 @@ def url_of(location: str) -> URL:
     if url.get_backend_name() == "sqlite" and (url.database or "").strip() in ("", ":memory:"):
         raise fail("store", f"{PLACE}; none keeps nothing", repr(location))
     return url.set(drivername="postgresql+psycopg") if url.get_backend_name() == "postgresql" else url
+
+
+def is_away(error: SQLAlchemyError) -> bool:
+    """Return whether a server does not answer, or ends its connections: it may answer later.
+
+    One that answers and refuses, as for a wrong password, would refuse again.
+    """
+    if not isinstance(error, DBAPIError) or isinstance(error.orig, sqlite3.Error):
+        return False
+    said = str(error.orig)
+    refused = "FATAL" in said and not any(words in said for words in PASSING)
+    lost = error.connection_invalidated or isinstance(error, OperationalError | InterfaceError)
+    return lost and not refused
 
 
 def _durably(connection: Any, _: object) -> None:

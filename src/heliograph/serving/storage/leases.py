@@ -1,8 +1,16 @@
 """Leases of the parts of the plants to processes, in the database that keeps the plants."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from sqlalchemy import Column, Connection, Float, Integer, MetaData, String, Table, delete, select, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import Engine
+from sqlalchemy.exc import SQLAlchemyError
+
+from heliograph.numerics.check import fail
+from heliograph.serving.storage.database import is_away
+from heliograph.serving.storage.store_protocol import AwayError
 
 TABLES = MetaData()
 PROCESSES = Table("processes", TABLES, Column("name", String(200), primary_key=True), Column("until", Float))
@@ -34,8 +42,12 @@ class Leases:
         TABLES.create_all(engine)
 
     def renew(self) -> set[int]:
-        """Report that this process is alive, and lease its parts anew: those that it has and those that are free."""
-        with self.engine.begin() as connection:
+        """Report that this process is alive, and lease its parts anew: those that it has and those that are free.
+
+        Raises:
+            AwayError: the database does not answer now.
+        """
+        with self._answering(), self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
             fair = self._fair(connection, now)
             leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
@@ -46,14 +58,24 @@ class Leases:
             expected = (mine + free)[:fair]
             return {number for number in expected if self._lease(connection, number, now)}
 
+    @contextmanager
+    def _answering(self) -> Iterator[None]:
+        try:
+            yield
+        except SQLAlchemyError as error:
+            if not is_away(error):
+                raise
+            said = str(getattr(error, "orig", error))
+            raise AwayError(str(fail("leases of parts", "a database that answers", said))) from None
+
     def release(self, number: int) -> None:
         """Release one part to other processes."""
-        with self.engine.begin() as connection:
+        with self._answering(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
 
     def leave(self) -> None:
         """Release everything to other processes."""
-        with self.engine.begin() as connection:
+        with self._answering(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 

@@ -29,8 +29,8 @@ from heliograph.live.snapshot import Identity, check_same, versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output
 from heliograph.serving.storage.carrier import DESCRIPTION, LISTED, Carrier, changes
-from heliograph.serving.storage.database import engine_at
-from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
+from heliograph.serving.storage.database import engine_at, is_away
+from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
 
 LAYOUT = "3"  # of these tables; those of layout 1 had no checksums, of 2 no description of the network
 LAYOUT_KEY = "layout of the store"
@@ -120,6 +120,9 @@ class Store:
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
                 if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
                     self.carry(carrier, f"store {self.name}", self.identity)
+        except AwayError:
+            self.close()
+            raise
         except InputError as error:
             self.close()
             fits = carrier is None and self.identity.get(LAYOUT_KEY) == LAYOUT
@@ -149,6 +152,8 @@ class Store:
             raise self._broken("bytes that are no text") from None
         except SQLAlchemyError as error:
             said = getattr(error, "orig", None) or type(error).__name__
+            if is_away(error):
+                raise AwayError(str(fail(f"store {self.name}", "a server that answers", str(said)))) from None
             raise fail(f"store {self.name}", expected, str(said)) from None
 
     def _stored_identity(self, mine: Identity | None) -> Identity:

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 from heliograph.live.fleet import Fleet
 from heliograph.live.snapshot import Identity, network_identity
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import InputError, instance
 from heliograph.serving.output import Kind, Output
 from heliograph.serving.storage.carrier import DESCRIPTION, description
 
@@ -44,6 +44,10 @@ class Entry(NamedTuple):
 
 class ConflictError(Exception):
     """Conflict of commits: another process has committed the plant; read it and use the messages again."""
+
+
+class AwayError(InputError):
+    """A store that does not answer now, and may answer later."""
 
 
 class StoreProtocol(Protocol):

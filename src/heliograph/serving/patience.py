@@ -1,0 +1,77 @@
+"""A service whose store may be away: it waits for a database as for a broker, and then goes on."""
+
+import asyncio
+import random
+from collections.abc import Callable, Sequence
+from time import sleep
+from typing import TypeVar
+
+from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST
+from heliograph.serving.loop import Takes
+from heliograph.serving.message import Payload
+from heliograph.serving.output import Output
+from heliograph.serving.storage.store_protocol import AwayError
+
+T = TypeVar("T")
+LOOK = 0.1  # seconds between looks at whether to stop
+
+
+def patiently(act: Callable[[], T], stop: asyncio.Event) -> T:
+    """Do something with a store, and do it again for as long as the store is away.
+
+    Raises:
+        AwayError: the store is away, and `stop` is set.
+    """
+    wait, trouble = FIRST, False
+    while True:
+        try:
+            done = act()
+        except AwayError as error:
+            if stop.is_set():
+                raise
+            shortened = wait * random.uniform(0.5, 1.0)
+            LOG.warning("%s; trying again in %.1f s", error, shortened)
+            wait, trouble = min(2 * wait, LONGEST), True
+            while shortened > 0 and not stop.is_set():
+                sleep(LOOK)
+                shortened -= LOOK
+        else:
+            if trouble:
+                LOG.info("the store is there again")
+            return done
+
+
+class Patient:
+    """A service that waits for its store: nothing is acknowledged before it is committed.
+
+    After a failed commit it is not known whether it was one: what the store has and nobody was told is published first.
+    """
+
+    def __init__(self, service: Takes, stop: asyncio.Event):
+        self.service, self._stop, self._failed = service, stop, False
+
+    def unpublished(self) -> list[Output]:
+        """Return outputs that were committed before a restart and may not have been published."""
+        return patiently(self.service.unpublished, self._stop)
+
+    def take(self, payloads: Sequence[Payload]) -> list[Output]:
+        """Let the service take a batch, once its store is there."""
+        return patiently(lambda: self._take(payloads), self._stop)
+
+    def _take(self, payloads: Sequence[Payload]) -> list[Output]:
+        before = self.service.unpublished() if self._failed else []
+        try:
+            outputs = self.service.take(payloads)
+        except AwayError:
+            self._failed = True
+            raise
+        self._failed = False
+        return before + outputs
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """Pass on that outputs were published."""
+        self.service.published(outputs)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """Let the service commit everything."""
+        return patiently(lambda: self.service.finish(ended), self._stop)
