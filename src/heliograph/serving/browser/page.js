@@ -123,7 +123,7 @@ function charts(view) {
   if (!pairs.has(chosen)) chosen = first;
   choose(at("filter"), names, chosen, (name) => { chosen = name; charts(last); });
   const [node, filter] = pairs.get(chosen);
-  // What may still change is not joined to what is final, and what became final since is not drawn twice.
+  // What became final since it was provisional is not drawn twice.
   const end = Math.max(...points.filter((point) => point.final).map((point) => seconds(point.time)));
   const drawn = points.filter((point) => point.final || !(seconds(point.time) <= end));
   at("charts").replaceChildren(...view.states.map((state, i) => chart(state, view.units[i], view.time_unit, drawn.map((point) => {
@@ -179,6 +179,10 @@ function chart(name, unit, timeUnit, row) {
   const final = row.filter((p) => p.final), edge = (side) => (p) => [x(seconds(p.time)), y(p.mean + side * p.wide)];
   if (final.some((p) => p.wide)) add("path", "area", { d: line([...final.map(edge(1)), ...final.slice().reverse().map(edge(-1))]) + "Z" });
   if (final.length) add("path", "mean", { d: line(final.map(edge(0))) });
+  // From the last final estimate through what may still change, dashed: nothing is missing between them.
+  const ahead = [...final.slice(-1), ...row.filter((p) => !p.final)];
+  if (ahead.length > 1) add("path", "mean ahead", { d: line(ahead.map(edge(0))) });
+  if (ahead.length > 1 && ahead.some((p) => p.wide)) add("path", "area ahead", { d: line([...ahead.map(edge(1)), ...ahead.slice().reverse().map(edge(-1))]) + "Z" });
   for (const p of row.filter((point) => !point.final)) {
     const [cx, cy] = edge(0)(p);
     if (p.wide) add("line", "bar", { x1: cx, x2: cx, y1: edge(1)(p)[1], y2: edge(-1)(p)[1] });
