@@ -1,34 +1,49 @@
 """The command `heliograph`, and `python -m heliograph`, as a process: Ctrl-C ends it without a word from the start."""
 
+import atexit
 import gc
 import os
 import signal
 import sys
+from contextlib import suppress
 from typing import NoReturn
 
 RARELY = 50_000, 20, 100  # what is imported and traced stays: the collector would look at it again and again
 
 
 def command() -> NoReturn:
-    """Run the command and end the process with its exit code."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # while it is imported there is nothing to undo
+    """Run the command and end the process with its exit code.
+
+    The process ends without the interpreter's own end, which would wait for threads, and free what threads of the
+    compilers still use.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _: os._exit(128 + number))  # while it is imported nothing is to undo
     gc.set_threshold(*RARELY)
-    from heliograph.cli import INTERRUPTED, main
+    from heliograph.cli import SIGNALLED, main
     from heliograph.numerics.stack import with_room
 
-    code = with_room(main)()
-    if code == INTERRUPTED:  # what other threads still compute is not waited for
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
     try:
-        sys.stdout.flush()
-    except OSError:  # it was said; the interpreter would say it again, in its own words, when it leaves
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: an interpreter that leaves would die of it otherwise
-    gc.freeze()  # the system takes all memory at once; the collector would look for what to free first
-    sys.exit(code)
+        code = with_room(main)()
+    except BaseException as error:
+        code = _code_of(error)
+    for number in (signal.SIGINT, signal.SIGTERM):  # all is done
+        signal.signal(number, signal.SIG_IGN)
+    if code <= SIGNALLED:  # what was interrupted may still be used by other threads
+        atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # it was said
+            stream.flush()
+    os._exit(code)
+
+
+def _code_of(error: BaseException) -> int:
+    """Return the exit code of an exception, as the interpreter does: traces of errors are written to stderr."""
+    if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
+        return error.code or 0
+    sys.excepthook(type(error), error, error.__traceback__)
+    return 1
 
 
 if __name__ == "__main__":

@@ -17,10 +17,11 @@ from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
-from heliograph.cli.stopping import INTERRUPTED, stoppable
+from heliograph.cli.stopping import INTERRUPTED, SIGNALLED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
+from heliograph.numerics.signals import uninterrupted
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
@@ -55,12 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with stoppable(stopped):
             code = _command(arguments)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return SIGNALLED + stopped[0] if stopped else INTERRUPTED
     except Exception:
-        if stopped:  # the interrupted code has reported it
-            return INTERRUPTED
-        raise
-    return INTERRUPTED if stopped else code
+        if not stopped:  # else the interrupted code has reported it
+            raise
+    return SIGNALLED + stopped[0] if stopped else code
 
 
 def _command(arguments: Sequence[str] | None) -> int:
@@ -69,6 +69,8 @@ def _command(arguments: Sequence[str] | None) -> int:
     # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
+        with uninterrupted():  # modules in C that import it print what interrupts them
+            import numpy  # noqa: F401
         code: int | None = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
         return code or 0

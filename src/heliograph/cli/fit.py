@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from heliograph.cli.app import number, path_option
 from heliograph.cli.reading import Measured, ReadingOptions, read_measured, single
+from heliograph.cli.stopping import GentleStop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,11 +36,11 @@ def fit(
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
     truth: Annotated[bool, Parameter(help="Learn from the true states (columns truth.STATE).", negative="")] = False,
     reading: ReadingOptions | None = None,
-) -> None:
+) -> int:
     """Learn the numbers that your own network marks as free by hg.free, with intervals and identifiability.
 
-    The estimates come from the earlier rows; the filters with them are judged on the later ones. Ctrl-C ends the search
-    and keeps the best so far.
+    The estimates come from the earlier rows; the filters with them are judged on the later ones. Ctrl-C (or SIGTERM)
+    ends the search and keeps the best so far; a second one ends at once.
 
     Parameters
     ----------
@@ -55,15 +56,18 @@ def fit(
     check_count("--starts", starts)
     check_seed("--seed", seed)
 
-    def work(advance: "Advance") -> "Learned":
-        return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions())
+    with GentleStop() as stop:
 
-    learned = write_results(out, 6, work, lambda learning: results(learning, out, network))
-    print(learned.fit)
+        def work(advance: "Advance") -> "Learned":
+            return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
+
+        learned = write_results(out, 6, work, lambda learning: results(learning, out, network))
+        print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
-    if learned.fit.stopped:
+    if stop.requested or learned.fit.stopped:
         print("heliograph: warning: stopped before the end; this is the best so far", file=sys.stderr)
+    return stop.code
 
 
 def learn(
@@ -75,6 +79,7 @@ def learn(
     advance: "Advance",
     truth: bool,
     reading: ReadingOptions,
+    stop: GentleStop,
 ) -> "Learned":
     """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
     advance("starting")
@@ -98,15 +103,17 @@ def learn(
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     cut = rows - int(held_out * rows)
-    fitted = _fitted(build, recording, cut, starts, seed, truth, advance)
+    fitted = _fitted(build, recording, cut, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
     # Predictions before and after the fit, then statistics of the losses.
+    z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
-    judged = changes(start, fitted.network, recording.measurements, recording.inputs, cut) if cut < rows else []
-    uniform = uniformity(fitted.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
+    judged = stop.unless_stopped(lambda: changes(start, fitted.network, z, u, cut) if cut < rows else []) or []
+    uniform = stop.unless_stopped(lambda: uniformity(fitted.network, judged, z, u, cut) if judged else []) or []
     advance("looking at losses")
-    fates = fates_of_measurements(recording.measurements)
-    losses = {name: learn_losses(fate) for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])}
+    fates = fates_of_measurements(z)
+    lossy = {name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])}
+    losses = stop.unless_stopped(lambda: {name: learn_losses(fate) for name, fate in lossy.items()}) or {}
     return Learned(network, str(measurements), fitted, cut, rows - cut, judged, uniform, losses)
 
 
@@ -137,8 +144,9 @@ def _fitted(
     seed: int,
     truth: bool,
     advance: "Advance",
+    stop: GentleStop,
 ) -> "Fit":
-    """Fit to the first rows, with progress by iterations of the search."""
+    """Fit to the first rows, with progress by iterations of the search, after each of which it may be stopped."""
     from heliograph.files.recording import Recording
     from heliograph.learning.fitting import Fit
     from heliograph.learning.fitting import fit as learn_from
@@ -147,6 +155,8 @@ def _fitted(
                       recording.time[:rows], None if recording.truth is None else recording.truth[:rows])  # fmt: skip
 
     def say(line: str) -> None:
+        stop.check()
+        stop.begin()
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)

@@ -3,26 +3,30 @@
 import signal
 import sys
 from _thread import interrupt_main
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Timer
-from types import FrameType
-from typing import NoReturn
+from types import FrameType, TracebackType
+from typing import NoReturn, TypeVar
 
-INTERRUPTED, TERMINATED = 130, 143  # 128 + the signal's number
+from heliograph.numerics.signals import STOPPING, handlers
 
+SIGNALLED = 128  # plus the signal's number: the exit code of what a signal ended
+INTERRUPTED, TERMINATED = SIGNALLED + signal.SIGINT, SIGNALLED + signal.SIGTERM
+
+T = TypeVar("T")
 SOON = 0.01  # seconds
 
 
 @contextmanager
 def stoppable(stopped: list[int]) -> Iterator[None]:
-    """Let signals to stop unwind the running code, so that no temporary file is left; record each in `stopped`.
+    """Let SIGINT and SIGTERM unwind the running code, so that no temporary file is left; record each in `stopped`.
 
     An interrupt that arrives in a callback of the compiler, or in a destructor, is swallowed there: it is raised again
     by a timer.
     """
 
-    # SIGINT raises KeyboardInterrupt, as usual, and is recorded.
+    # Both raise KeyboardInterrupt, which nobody takes for an error, and are recorded.
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
         stopped.append(number)
         raise KeyboardInterrupt
@@ -31,26 +35,83 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
     def swallowed(what: "sys.UnraisableHookArgs") -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
             again.append(Timer(SOON, interrupt_main))  # not here: it would be swallowed once more
+            again[-1].daemon = True
             again[-1].start()
         else:
             known(what)
 
-    # Install the handlers, and restore the previous ones at the end.
     again: list[Timer] = []
-    known, terminate = sys.unraisablehook, signal.signal(signal.SIGTERM, _terminate)
-    received = signal.getsignal(signal.SIGINT)
-    if received is not signal.SIG_IGN:  # as in the background, where nobody's Ctrl-C is meant
-        signal.signal(signal.SIGINT, interrupt)
-    sys.unraisablehook = swallowed
+    known, sys.unraisablehook = sys.unraisablehook, swallowed
     try:
-        yield
+        with handlers(interrupt):
+            yield
     finally:
         for timer in again:
             timer.cancel()
         sys.unraisablehook = known
-        signal.signal(signal.SIGTERM, terminate)
-        signal.signal(signal.SIGINT, received)
 
 
-def _terminate(_: int, __: FrameType | None) -> None:
-    raise SystemExit(TERMINATED)  # unwinds, so that no temporary file stays
+class GentleStop:
+    """A stop that keeps what there is: from `begin` on the first signal is only noted, and a second one unwinds.
+
+    As a context it gives the signals back at its end.
+    """
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "GentleStop":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._give_back()
+
+    @property
+    def requested(self) -> bool:
+        """Return whether a signal came."""
+        return bool(self._number)
+
+    @property
+    def code(self) -> int:
+        """Return the command's exit code: 0, or the one that says which signal stopped it."""
+        return SIGNALLED + self._number if self._number else 0
+
+    def begin(self) -> None:
+        """Only note the next signal."""
+        if not self._before and not self._number:
+            self._before = {number: signal.getsignal(number) for number in STOPPING}
+            for number, handler in self._before.items():
+                if handler is not signal.SIG_IGN:
+                    signal.signal(number, self._note)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal came."""
+        if self._number:
+            raise KeyboardInterrupt
+
+    def unless_stopped(self, work: Callable[[], T]) -> T | None:
+        """Return the value of work that may be left out, None if a signal came before its end."""
+        if self._number:
+            return None
+        try:
+            with handlers(self._interrupt):
+                return work()
+        except KeyboardInterrupt:
+            if not self._number:
+                raise
+        self._give_back()
+        return None
+
+    def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
+        self._number = number
+        raise KeyboardInterrupt
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        self._number = number
+        self._give_back()
+
+    def _give_back(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._before = {}

@@ -5,11 +5,12 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from glob import escape as glob_escape
 from pathlib import Path
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.signals import uninterrupted
 
 try:
     import fcntl
@@ -130,18 +131,20 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         with naming(paths[0]):
             yield partials
         # Replace one by one, with the earlier contents of all but the last.
-        for partial, path in zip(partials, paths, strict=True):
-            before = path.read_bytes() if path != paths[-1] and path.exists() else None
-            with naming(path):
-                replace(partial, path)
-            replaced.append((path, before))
+        with uninterrupted():
+            for partial, path in zip(partials, paths, strict=True):
+                before = path.read_bytes() if path != paths[-1] and path.exists() else None
+                with naming(path):
+                    replace(partial, path)
+                replaced.append((path, before))
     except BaseException:
         # Undo: remove temporary files, restore those that were replaced.
-        for partial in partials:
-            partial.unlink(missing_ok=True)
-        if len(replaced) < len(paths):
-            for path, before in replaced:
-                path.unlink() if before is None else path.write_bytes(before)
+        with uninterrupted():
+            for partial in partials:
+                partial.unlink(missing_ok=True)
+            if len(replaced) < len(paths):
+                for path, before in replaced:
+                    path.unlink() if before is None else path.write_bytes(before)
         raise
 
 
@@ -221,29 +224,39 @@ def whole_folder(target: Path) -> Iterator[Path]:
     """
     clear_left(target)
     made = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    # Write to a temporary folder in the same file system.
-    new, old = partial / "new", partial / "old"
+    partial, mine = target.parent, ExitStack()
     try:
-        new.mkdir()
-        with held(partial), naming(target):
-            yield new
-            sync_tree(new)
-        # Swap by two renames.
-        if target.exists():
-            target.rename(old)
-        new.rename(target)
-        sync(target.parent)
+        # Write to a temporary folder in the same file system.
+        with uninterrupted():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+            (partial / "new").mkdir()
+            mine.enter_context(held(partial))
+        with mine, naming(target):
+            yield partial / "new"
+            sync_tree(partial / "new")
+        with uninterrupted():
+            _swap(partial, target)
     except BaseException:
         # Undo: restore earlier results, remove everything that was made.
-        if old.exists() and not target.exists():
-            old.rename(target)
-        shutil.rmtree(partial)
-        for folder in made:
-            with suppress(OSError):  # somebody else's files came into it meanwhile
-                folder.rmdir()
+        with uninterrupted():
+            mine.close()
+            if (partial / "old").exists() and not target.exists():
+                (partial / "old").rename(target)
+            if partial != target.parent:
+                shutil.rmtree(partial, ignore_errors=True)
+            for folder in made:
+                with suppress(OSError):  # somebody else's files came into it meanwhile
+                    folder.rmdir()
         raise
+
+
+def _swap(partial: Path, target: Path) -> None:
+    """Put the new folder in the place of the old one by two renames, and remove that."""
+    if target.exists():
+        target.rename(partial / "old")
+    (partial / "new").rename(target)
+    sync(target.parent)
     shutil.rmtree(partial)
 
 
