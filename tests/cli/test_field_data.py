@@ -354,3 +354,29 @@ def test_a_pipe_of_a_service_has_lines_of_text_too(folder):
     (folder / "net.py").write_text(f'{WALK}\nsources = {{"t": field("", node="a")}}\n')
     bodies = served(folder, [f"2026-09-27T10:00:0{k}Z t {20 + k}" for k in range(3)])
     assert next(b for b in bodies if b["kind"] == "final")["estimates"]["a"]["k"]["mean"] == [20.0]
+
+
+def test_inspect_proposes_what_looks_like_the_measurement_and_the_count(folder, capsys):
+    """Of a LoRaWAN device, and of one with a battery and a link; what it proposes is Python that runs."""
+    frame = json.loads(json.loads(UPLINKS[1])["payload"])
+    frame["uplink_message"] |= {
+        "rx_metadata": {"rssi": -80},
+        "settings": {"data_rate": {"lora": {"bandwidth": 125000}}},
+    }
+    lines = [json.dumps({"topic": "v3/up", "payload": json.dumps(frame)})]
+    lines.append('{"topic": "zigbee2mqtt/attic", "payload": {"battery": 98, "linkquality": 80, "temperature": 20.5}}')
+    (folder / "log.jsonl").write_text("\n".join(lines))
+    assert cli.main(["inspect", "log.jsonl"]) == 0
+    said = capsys.readouterr().out
+    scope: dict[str, object] = {"hg": hg}
+    exec(said[said.index("sources = {") :], scope)
+    up = hg.files.json_field(
+        "uplink_message.decoded_payload.t", "NODE", "OUTPUT", time="received_at", sequence="uplink_message.f_cnt"
+    )
+    assert scope["sources"] == {
+        "v3/up": up,
+        "zigbee2mqtt/attic": hg.files.json_field("temperature", "NODE", "OUTPUT"),
+    }
+    (folder / "table.csv").write_text("battery,level,seq,at\n98,1.5,1,2026-09-27T10:00:00Z\n")
+    assert cli.main(["inspect", "table.csv"]) == 0
+    assert "json_field('level', node='NODE', output='OUTPUT', time='at', sequence='seq')" in capsys.readouterr().out

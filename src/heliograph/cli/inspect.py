@@ -19,12 +19,13 @@ def inspect(
     ] = "",
     seconds: Annotated[float, Parameter(help="How long to listen to a broker.")] = 10.0,
 ) -> None:
-    """List the topics of a bag or of a broker: rates, gaps and lateness, and `sources` to paste into a network's file.
+    """List the topics of a bag, a file or a broker: rates, gaps, lateness, and `sources` to paste into a network.
 
     Parameters
     ----------
     recording:
-        A bag (.mcap, .db3, .bag, or a folder), or the URL of a broker: mqtt://, nats:// or opc.tcp://.
+        A bag (.mcap, .db3, .bag, or a folder), a file of messages (lines of JSON, a log, a table), or the URL of a
+        broker: mqtt://, nats:// or opc.tcp://.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.inspection import suggestion
@@ -48,7 +49,9 @@ def inspect(
 
 def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
     """Look at the bag, or listen for a while; return the topics, and what is broken in the bag."""
-    from heliograph.files.inspection import inspect_bag
+    from heliograph.files.inspection import inspect_bag, inspect_file
+    from heliograph.files.message_files import LINES
+    from heliograph.files.table import kind_of
     from heliograph.report.progress import progress
 
     with progress(2) as advance:
@@ -58,7 +61,11 @@ def _topics(recording: str, seconds: float) -> "tuple[dict[str, Topic], str]":
 
             advance(f"listening for {seconds:g} s")
             return listen(address(recording), seconds), ""
-        return inspect_bag(Path(recording), lambda done, total: advance(f"reading {recording}", done, total))
+        path = Path(recording)
+        if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
+            advance(f"reading {recording}")
+            return inspect_file(path)
+        return inspect_bag(path, lambda done, total: advance(f"reading {recording}", done, total))
 
 
 def _print_table(topics: "dict[str, Topic]") -> None:

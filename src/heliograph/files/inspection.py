@@ -1,23 +1,37 @@
 """Topics of a bag or a broker: their rates, gaps and lateness, and sources to paste."""
 
-import json
+import re
 import struct
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from heliograph.files.bag import OFTEN, Progress, fields_of, opened
-from heliograph.files.fields import nanoseconds
-from heliograph.files.mcap_chunks import messages_of
+from heliograph.files.fields import decoded, nanoseconds
+from heliograph.files.mcap_chunks import messages_of as bag_messages
+from heliograph.files.message_files import is_message_file, message_name, messages_of, payload_of
 from heliograph.numerics.check import InputError, fail, shown_error
 from heliograph.numerics.dates import looks_like_date
 
 SECOND = 1e9  # nanoseconds
 STAMP = "header.stamp"
 FEW = 6  # fields that a suggestion lists
+# What messages of devices say of themselves, and not of what they measure; words of a dotted path.
+HOUSEKEEPING = re.compile(
+    r"battery|batt|bat|voltage|linkquality|rssi|lqi|snr|link|signal|f_port|fport|port|channel|frequency|bandwidth|"
+    r"spreading|coding|gateway|gateways|rx_metadata|rxinfo|txinfo|settings|data_rate|datarate|dr|version|firmware|"
+    r"model|id|uptime|heap|free|wifi|timestamp|consumed_airtime|airtime|adr|confirmed|retain|qos|mid|status|error|"
+    r"errors|code|locations|header|covariance|layout"
+)
+# Names of running counts.
+COUNTS = re.compile(
+    r"f_cnt|fcnt|fcntup|seq|sequence|seq_no|seqno|counter|count|cnt|packet|packet_id|msg_id|frame_count"
+)
+PAYLOADS = ("decoded_payload", "object", "value", "state", "measurement")  # levels under which values stand
 NO_NUMBERS = ("string", "wstring", "list", "char", "wchar")
 
 
@@ -29,6 +43,7 @@ class Topic:
         kind: type of the messages.
         fields: dotted paths of their numbers.
         time: dotted path of their time; None if they have none.
+        count: dotted path of their running count; None if they have none.
     """
 
     kind: str
@@ -36,6 +51,15 @@ class Topic:
     time: str | None = None
     logged: "array[int]" = field(default_factory=lambda: array("q"))
     late: "array[float]" = field(default_factory=lambda: array("d"))
+
+    @property
+    def count(self) -> str | None:
+        """Return the path of what is named as a running count is."""
+        return next((path for path in self.fields if COUNTS.fullmatch(path.split(".")[-1].lower())), None)
+
+    def measured(self) -> list[str]:
+        """Return the fields, those first that look like measurements."""
+        return sorted((path for path in self.fields if path != self.count), key=_unlikely)
 
     def row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
@@ -68,7 +92,7 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         # When each message was logged, and how late by its stamp.
         total, done = reader.message_count, 0
         try:
-            for done, (connection, logged, data) in enumerate(messages_of(reader, reader.connections), 1):
+            for done, (connection, logged, data) in enumerate(bag_messages(reader, reader.connections), 1):
                 topic = topics[connection.topic]
                 topic.logged.append(logged)
                 if topic.time is not None and len(data) >= 12:
@@ -80,25 +104,55 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
         return topics, cut
 
 
-def note(topics: dict[str, Topic], name: str, payload: bytes, arrival: int) -> None:
+def note(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
-        content = json.loads(payload)
-        kind = "JSON"
-    except (ValueError, RecursionError):
-        content, kind = None, "no JSON"
+        _note(topics, name, decoded(payload, name), "JSON", arrival)
+    except InputError:
+        _note(topics, name, None, "no JSON", arrival)
+
+
+def _note(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
     topic = topics.setdefault(name, Topic(kind))
-    topic.logged.append(arrival)
+    if arrival is not None:
+        topic.logged.append(arrival)
     for path, value in _leaves(content):
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
         # A date in a message may be the time of its measurement.
         if isinstance(value, str) and looks_like_date(value) and topic.time in (None, path):
-            try:
-                topic.late.append((arrival - nanoseconds(value, "s", path)) / SECOND)
+            with suppress(InputError):
+                time = nanoseconds(value, "s", path)
                 topic.time = path
-            except InputError:
-                continue
+                if arrival is None:
+                    topic.logged.append(time)
+                else:
+                    topic.late.append((arrival - time) / SECOND)
+
+
+def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
+    """Return the topics of a file of messages, and the first reason why one cannot be read, "" if all can be.
+
+    Raises:
+        ValueError: no such file, or one that cannot be read at all.
+    """
+    topics, broken = dict[str, Topic](), ""
+    for message in messages_of(path):
+        if isinstance(message, InputError):
+            broken = broken or str(message)
+            continue
+        name = message.topic or message_name(path)
+        came = None
+        with suppress(InputError):
+            came = None if message.arrival is None else nanoseconds(message.arrival, "s", message.where)
+        if message.topic is not None and isinstance(message.content, str) and came is not None:
+            note(topics, name, message.content, came)
+            continue
+        try:
+            _note(topics, name, payload_of(message), "JSON" if is_message_file(path) else "row", came)
+        except InputError:
+            _note(topics, name, None, "no JSON", came)
+    return topics, broken
 
 
 def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
@@ -111,13 +165,23 @@ def suggestion(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) 
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
     lines.append("sources = {")
     for name, topic in sorted(topics.items()):
-        if not topic.fields:
+        fields = topic.measured()
+        if not fields:
             continue
-        more = ", ".join(topic.fields[1:FEW]) + (", ..." if len(topic.fields) > FEW else "")
+        more = ", ".join(fields[1:FEW]) + (", ..." if len(fields) > FEW else "")
         when = "" if topic.time is None else f", time={topic.time!r}"
-        lines.append(f"    {name!r}: hg.files.json_field({topic.fields[0]!r}, node='NODE', output='OUTPUT'{when}),")
+        when += "" if topic.count is None else f", sequence={topic.count!r}"
+        lines.append(f"    {name!r}: hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{when}),")
         lines += [f"    #   or {more}"] if more else []
     return "\n".join([*lines, "}"])
+
+
+def _unlikely(path: str) -> int:
+    """Return how little a field looks like a measurement: 0 under a payload, 2 for what devices say of themselves."""
+    words = path.lower().split(".")
+    if any(HOUSEKEEPING.fullmatch(word) for word in words):
+        return 2
+    return 0 if any(word in PAYLOADS for word in words) else 1
 
 
 def _stamp(data: bytes) -> int:
