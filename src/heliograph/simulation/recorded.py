@@ -16,6 +16,7 @@ from heliograph.numerics.float64 import check_process, quickly_compiled, to_nump
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.centres.uplinks import Drawn, SentReports
+from heliograph.simulation.description.wide_angles import beyond_a_turn, wide_in_rows
 from heliograph.simulation.judging import any_implausible, doubts, forbidden_rows, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
@@ -85,6 +86,8 @@ def run(
     for name, node in network.nodes.items():
         z[name] = _within(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])
+    for line in beyond_a_turn(network, z):
+        warnings.warn(line, stacklevel=2)
     # Filters, on what a recording without implausible data has.
     smoothing = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, smoothing and smoothing.kinds, judges=True)
@@ -97,6 +100,8 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     warn_of_no_numbers(record)
+    for line in wide_in_rows(network, record):
+        warnings.warn(line, stacklevel=2)
     return record if true is None else with_truth(record, network.plant, true, smooth)
 
 

@@ -25,7 +25,8 @@ class Unscented(AbstractTransform):
 
         mean = f(m) + d,  covariance = sum_i e_i e_i' / (2 c) + (beta - alpha^2) d d',  d = sum_i e_i / (2 c),
 
-    which loses no digits where alpha is small and the weight of m is large and negative. Merwe's points are these;
+    which, where alpha is small and the weight of m large and negative, loses no digits but those of f itself, whose
+    rounding is divided by alpha^2. Merwe's points are these;
     Julier's are those with alpha = 1 and beta = 0, and `Cubature` has kappa = 0 besides. The covariance is positive
     semidefinite for every f where alpha^2 kappa + beta n >= 0 (by Cauchy and Schwarz, d d' is at most n / c times the
     sum), and indefinite for some f elsewhere.
@@ -47,7 +48,7 @@ class Unscented(AbstractTransform):
     beta: Scalar
     kappa: Scalar
 
-    def __init__(self, alpha: Scalar = 1e-3, beta: Scalar = 2.0, kappa: Scalar = 0.0):
+    def __init__(self, alpha: Scalar = 1.0, beta: Scalar = 2.0, kappa: Scalar = 0.0):
         self.alpha, self.beta = scalar("alpha", alpha, TINY), scalar("beta", beta)
         self.kappa = scalar("kappa", kappa)
 
@@ -83,7 +84,7 @@ def unscented_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: "Channel|None" = None,
-    alpha: float = 1e-3,
+    alpha: float = 1,
     beta: float = 2,
     kappa: float = 0,
     update: "AbstractUpdate|None" = None,
@@ -92,14 +93,20 @@ def unscented_filter(
 ) -> "GaussianFilter":
     """Unscented Kalman filter (UKF) on its channel's second moments; the points are redrawn after each prediction.
 
-    Merwe's points by default; Julier's are alpha = 1, beta = 0; with kappa = 0 besides it is `cubature_filter`, which
-    needs no choice of a parameter.
+    By default the points are those of `cubature_filter`, sqrt(n) deviations from the mean, and so are the means; the
+    covariance has Merwe's beta = 2 besides, by which that of a quadratic function of one Gaussian number is exact, so
+    that a step is never surer of itself than cubature's. Julier's points are alpha = 1, beta = 0.
+
+    Other packages take alpha = 0.001. For quadratic functions of one number alpha changes nothing, as the variance is
+    4 m^2 P + (alpha^2 kappa + beta) P^2. For all others such points make a second derivative at the mean, which says
+    nothing of what lies a deviation away, and divide the difference of values so near each other by alpha^2: of the
+    digits of f, six are lost.
 
     Args:
         plant: the plant, n states.
         sensor: its sensor, m outputs.
         channel: from the sensor to the filter; by default all arrives as it is. The memory of a channel is ignored.
-        alpha: spread of the points, above 0 (default 0.001).
+        alpha: spread of the points, above 0 (default 1).
         beta: weight of the mean's curvature, 2 for a Gaussian state (default 2).
         kappa: second spread; alpha^2 kappa + beta n may not be negative (default 0).
         update: how an uncertain channel is bounded; `Polytope()` by default.

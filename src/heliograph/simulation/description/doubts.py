@@ -20,6 +20,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
 from heliograph.simulation.description.diagram import listed, shared
+from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -42,6 +43,7 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         network: the network.
     """
     lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network), *_other_worlds(network)]
+    lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
     return sorted(lines, key=lambda doubt: not doubt.serious)
 

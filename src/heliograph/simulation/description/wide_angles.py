@@ -1,0 +1,95 @@
+"""Doubts about angles: one that is known no better than a good part of the circle, and degrees among radians."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.transform import Cubature
+from heliograph.filters.gaussian.unscented import Unscented
+from heliograph.model.channel import received_angles
+from heliograph.model.over_time import first
+from heliograph.model.sensor import is_linear
+from heliograph.numerics.angle import TURN
+from heliograph.numerics.types import Float
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.results.record import Record
+
+WIDE = 1.0  # rad: a Gaussian of this deviation has E cos = 0.61, and what lies beyond pi is not on the circle any more
+REMEDY = "on the circle that is no Gaussian any more: start from an angle that data show"
+
+
+def largest_deviation(filter: AbstractFilter) -> float:
+    """Return the deviation of an angle up to which a filter can take it for a Gaussian, in radians.
+
+    No more than WIDE; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may not lie
+    beyond half a turn, where they are taken for points of the other side.
+    """
+    inner = getattr(filter, "base", filter)
+    transform, n = getattr(inner, "transform", None), len(filter.states)
+    if isinstance(inner, GaussianFilter) and is_linear(inner.plant, inner.sensor):  # no points are drawn
+        return WIDE
+    if isinstance(transform, Cubature):
+        return min(WIDE, float(np.pi / n**0.5))
+    if isinstance(transform, Unscented):
+        return min(WIDE, float(np.pi / (float(transform.alpha) * (n + float(transform.kappa)) ** 0.5)))
+    return WIDE
+
+
+def wide_at_the_start(network: Network) -> Iterator[str]:
+    """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
+    lines: dict[tuple[str, str, float], list[str]] = {}
+    for node, label, filter in _filters(network):
+        covariance = np.asarray(filter.estimate(filter.init()).covariance)
+        for name, deviation in _deviations(network, filter, covariance):
+            if deviation > largest_deviation(filter):
+                lines.setdefault((name, label, float(deviation)), []).append(node)
+    for (name, label, known), nodes in lines.items():
+        where = f"{label!r} of {', '.join(map(repr, nodes[:3]))}{', ...' if len(nodes) > 3 else ''}"
+        yield f"wide angle: {where} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
+
+
+def wide_in_rows(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each filter that knew an angle less well in some row than it can use."""
+    for node, label, filter in _filters(network):
+        covariance = np.asarray(record.estimates[node][label].covariance)
+        for name, deviation in _deviations(network, filter, covariance):
+            wide = np.flatnonzero(deviation > largest_deviation(filter))
+            if wide.size:
+                known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
+                rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
+                yield f"{node}/{label}: {known} {rows}; {REMEDY}"
+
+
+def _filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
+    """Yield the filters that have angles, with their places."""
+    if not first(network.plant).circular:
+        return
+    for node, here in network.nodes.items():
+        yield from ((node, label, filter) for label, filter in here.filters.items() if filter.angles_used())
+    for label, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter) and fusion.angles_used():
+            yield FUSED, label, fusion
+
+
+def _deviations(
+    network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
+) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
+    """Yield each angle's name and deviation."""
+    used = filter.angles_used()
+    for i in () if used is None or filter.claim == "none" else used.states:
+        yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
+
+
+def beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
+    """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
+    for name, node in network.nodes.items():
+        for i in received_angles(network.plant, node.sensor, node.channel) if isinstance(node, Node) else ():
+            far = np.abs(z[name][:, i]) > TURN
+            if np.any(far):
+                row = int(np.argmax(far))
+                said = f"{np.count_nonzero(far)} of {np.count_nonzero(~np.isnan(z[name][:, i]))} values are beyond 2 pi"
+                value = f"row {row + 1}: {z[name][row, i]:.4g}"
+                yield f"node {name!r}: {node.received_names[i]!r} is an angle in radians, and {said}; {value}: degrees?"

@@ -1,0 +1,83 @@
+"""Angles that are known no better than a good part of the circle, and degrees: said before data and of a recording."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.simulation.description.doubts import doubts_before_data
+
+
+def move(x, u):
+    return jnp.stack([x[0] + 0.1 * x[3] * jnp.cos(x[2]), x[1] + 0.1 * x[3] * jnp.sin(x[2]), x[2], x[3]])
+
+
+def driving(deviation, make=hg.cubature_filter, circular=("yaw",)):
+    plant = hg.Plant(move, np.diag([1e-6, 1e-6, 1e-8, 1e-6]), [0, 0, 0, 1.0], np.diag([1e-4, 1e-4, deviation**2, 1e-4]),
+                     states=["x", "y", "yaw", "v"], circular=circular)  # fmt: skip
+    wheel = hg.LinearSensor([[0, 0, 0, 1.0]], 1e-4, outputs=["speed"])
+    return hg.Network(plant, {"n": hg.Node(wheel, hg.perfect(), {"f": make(plant, wheel, hg.perfect())})})
+
+
+def said_before_data(network):
+    return [doubt.words for doubt in doubts_before_data(network) if "wide angle" in doubt.words]
+
+
+MAKERS = [hg.cubature_filter, hg.extended_filter, hg.unscented_filter,
+          lambda *parts: hg.unscented_filter(*parts, alpha=1e-3)]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", MAKERS)
+def test_a_heading_that_nothing_measures_is_said(make):
+    """Of 60 m driven 8.1 +- 41.7 is right; these filters say 14 +- 3, 60 +- .04, or -60 +- 7."""
+    network = driving(2.0, make)
+    (line,) = said_before_data(network)
+    assert line.startswith("wide angle: 'f' of 'n' starts with 'yaw' known to +- 2 rad; ")
+    with pytest.warns(UserWarning, match=r"^n/f: 'yaw' is known to \+- 2 rad in 3 of 3 rows, first in row 1; "):
+        hg.run(network, {"n": np.ones((3, 1))})
+
+
+def test_what_is_known_well_enough_is_not():
+    """Points of 4 states lie 2 deviations away: at 0.9 rad still before half a turn; of more than 9 states at less."""
+    for network in (driving(0.9), driving(2.0, circular=())):
+        assert not said_before_data(network)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            hg.run(network, {"n": np.ones((3, 1))})
+    sensor, said = hg.LinearSensor(np.eye(16)[:1], 0.01, circular=["y0"]), []
+    for many in (hg.Plant(lambda x, u: x, 0.01, np.zeros(16), 0.9**2, circular=["x0"]),
+                 hg.LinearPlant(np.eye(16), 0.01, np.zeros(16), 0.9**2, circular=["x0"])):  # fmt: skip
+        node = hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(many, sensor)})
+        said.append(len(said_before_data(hg.Network(many, {"n": node}))))
+    assert said == [1, 0]  # what is linear needs no points
+
+
+def test_degrees_are_doubted():
+    plant = hg.LinearPlant([[1.0]], 0.01, [0.0], 0.1, states=["heading"], circular=["heading"])
+    sensor = hg.LinearSensor([[1.0]], 0.1, outputs=["compass"], circular=["compass"])
+    network = hg.Network(plant, {"n": hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})})
+    z = np.array([1.0, np.nan, 6.2, 42.0])[:, None]
+    with pytest.warns(UserWarning) as said:
+        hg.run(network, {"n": z})
+    expected = "node 'n': 'compass' is an angle in radians, and 1 of 3 values are beyond 2 pi; row 4: 42: degrees?"
+    assert expected in [str(warning.message) for warning in said]
+
+
+def test_the_default_points_keep_the_digits_of_large_coordinates():
+    """At 5,000,000 m: equal to cubature to the rounding of a coordinate, some 1e-9; with alpha = .001 to 1 mm."""
+    plant = hg.Plant(lambda x, u: jnp.stack([x[0] + 0.1 * x[1], x[1]]), 1e-4 * np.eye(2), [5e6, 1.0], np.eye(2))
+    sensor, z = hg.Sensor(lambda x: x[:1] - 5e6, 1e-2), 0.1 * np.arange(1, 101)[:, None]
+    means = [f.run(z).means for f in (hg.unscented_filter(plant, sensor), hg.cubature_filter(plant, sensor))]
+    np.testing.assert_allclose(means[0], means[1], rtol=0, atol=1e-7)
+
+
+def test_the_default_moments_of_a_square_are_exact():
+    """Of one Gaussian number x: E x^2 = m^2 + P, Var x^2 = 4 m^2 P + 2 P^2."""
+    with jax.enable_x64(True):
+        moments = hg.filters.Unscented().apply(lambda x: x**2, jnp.array([3.0]), jnp.array([[0.5]]))
+    assert float(moments.mean[0]) == pytest.approx(9.5)
+    assert float(moments.covariance[0, 0]) == pytest.approx(4 * 9 * 0.5 + 2 * 0.25)
