@@ -267,11 +267,14 @@ class Fleet:
                     self.pool.jump(legs[0].steps[-1][1], legs[0].jump)
             walks = [legs[1:] for legs in walks if len(legs) > 1]
 
+    def step_row(self, before: HeldRow, row: HeldRow) -> None:
+        """Step from a row into another one, which is none of a plant's."""
+        self.pool.table[row.slot, self.pool.numbers] = row.numbers
+        self._run([[before, row]])
+
     def look(self, row: HeldRow, time: float, slot: int) -> None:
         """Predict from a row to a later time, into a slot that no row has."""
-        there = HeldRow((float(time), 0, 0), slot, self.width)
-        self.pool.table[slot, self.pool.numbers] = there.numbers
-        self._run([[row, there]])
+        self.step_row(row, HeldRow((float(time), 0, 0), slot, self.width))
 
     def trial(
         self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]

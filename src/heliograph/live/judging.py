@@ -1,6 +1,7 @@
 """Plausibility of the events of a batch: an event is implausible if no filter of its node could use it."""
 
 from collections.abc import Sequence
+from math import nan
 from typing import TypeAlias
 
 import numpy as np
@@ -26,10 +27,12 @@ class Judges:
     def __init__(self, fleet: Fleet):
         self.fleet, places = fleet, fleet.lanes.places
         central = _columns([output for output in places if output.node == FUSED])
-        self._columns = {}
+        self._columns, self._central = {}, set[int]()  # nodes without a filter of their own
         for index, name in enumerate(fleet.network.names):
             of_node = _columns([output for output in places if output.node == name and _listens(fleet, output)])
             self._columns[index] = of_node if len(of_node) else central
+            if not len(of_node):
+                self._central.add(index)
         self._every = _columns(places)
 
     def implausible_inputs(
@@ -68,6 +71,7 @@ class Judges:
                 spoilt[plant.name] = min(first, i, key=lambda j: taken[j][-1].key)
             if why:
                 reasons[i] = why
+        self._blame(taken, reasons)
         # Of one node in one row the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
@@ -76,6 +80,36 @@ class Judges:
             largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _size(taken[j][2]))
         first_of_plant = {i: why for i, why in reasons.items() if spoilt.get(taken[i][1].name, i) == i}
         return {i: why for i, why in first_of_plant.items() if i in largest.values()}
+
+    def _blame(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
+        """Leave of the events of several nodes in one row, which a central filter judged together, the one to blame.
+
+        That is the first, from the largest on, without which the row is plausible; the largest if there is none.
+        """
+        rows: dict[int, list[int]] = {}
+        for i in reasons:
+            if taken[i][2].node_index in self._central:
+                rows.setdefault(taken[i][-1].slot, []).append(i)
+        for those in rows.values():
+            if len({taken[i][2].node_index for i in those}) > 1:
+                those.sort(key=lambda i: _size(taken[i][2]), reverse=True)
+                blamed = next((i for i in those if self._plausible_without(taken[i])), those[0])
+                for i in those:
+                    if i != blamed:
+                        del reasons[i]
+
+    def _plausible_without(self, candidate: Candidate) -> bool:
+        """Step a row without what it has of a node; is it plausible then?"""
+        _, plant, event, row = candidate
+        pool, rows = self.fleet.pool, plant.rows
+        there = HeldRow(row.key, pool.take(), self.fleet.width)
+        there.numbers = row.numbers.copy()
+        at = rows.places[event.node_index]
+        there.numbers[at] = [nan] * (at.stop - at.start)
+        self.fleet.step_row(rows.held[rows.index(row.key) - 1], there)
+        plausible = why_values(pool.table[there.slot, pool.outputs][self._columns[event.node_index]]) is None
+        pool.give([there.slot])
+        return plausible
 
 
 def _size(event: Known) -> float:

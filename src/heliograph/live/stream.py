@@ -1,10 +1,12 @@
 """One filter on live data: push a measurement, read the estimate."""
 
+import warnings
 from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
+from scipy.stats import chi2
 
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.event.gaussian_sum import EventFilter
@@ -15,7 +17,7 @@ from heliograph.live.senders import LossChain, SenderStatus, sender_status
 from heliograph.live.snapshot import Identity, check_same, packed, short_name, unpacked, versions
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
-from heliograph.model.estimate import Estimate, with_sound_claim
+from heliograph.model.estimate import JudgedEstimate, with_sound_claim
 from heliograph.model.faults import function_fault
 from heliograph.model.inputs import check_inputs
 from heliograph.model.limits import LimitsLike, limits_of
@@ -23,6 +25,8 @@ from heliograph.numerics.caching import shared
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, PyTree
+
+BEYOND, RARE = 10, 1e-4  # measurements in a row, each beyond what an honest filter sees so seldom
 
 
 @readable
@@ -39,6 +43,9 @@ class Stream:
             `dropped` counts them by component.
         invalid: codes for a missing value, as of a `Node`.
 
+    A filter that was sure of a wrong start, behind a gate, leaves out all that comes: where BEYOND measurements in a
+    row are further off than one in 10,000 should be, a warning says so, and `doubt` until one is not.
+
     Raises:
         ValueError: no filter, or invalid limits.
     """
@@ -49,12 +56,25 @@ class Stream:
         self.filter = filter
         self.limits = limits_of(filter.received, limits, invalid)
         self.dropped = np.zeros(filter.received, dtype=np.int64)
-        self.steps, self._last = 0, -1
+        self.steps, self._last, self._beyond = 0, -1, 0
         self._placed = _place(filter)
         self._stepper = self._placed.stepper()
 
-    def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> Estimate:
+    @property
+    def doubt(self) -> str:
+        """Return in words that the last measurements were all not expected; "" where they were."""
+        if self._beyond < BEYOND:
+            return ""
+        return (
+            f"the last {self._beyond} measurements were each further off than one in {1 / RARE:,.0f} should be: "
+            f"{type(self.filter).__name__} is lost, or surer than it may be; one that leaves out what is far does not "
+            "come back from a wrong start, and begins anew with a larger initial covariance"
+        )
+
+    def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> JudgedEstimate:
         """Advance one step: `inputs` led to this `measurement`; return the posterior estimate.
+
+        It has the squared innovation of the measurement, `nis`, and how many numbers arrived, `received`.
 
         Args:
             measurement: received values, shape (received,); NaN where a component did not arrive.
@@ -86,8 +106,17 @@ class Stream:
             self._last = k
         if outside is not None:
             self.dropped += outside
-        estimate: Estimate = placed.estimate.unflatten(stepper.estimate)
-        return with_sound_claim(estimate) if np.isnan(stepper.judgement[0]) else estimate
+        nis, arrived = stepper.judgement[:2].tolist()
+        if arrived and nis == nis:
+            self._judge(nis > placed.rare[int(arrived)])
+        estimate: JudgedEstimate = placed.estimate.unflatten([*stepper.estimate, nis, int(arrived)])
+        return with_sound_claim(estimate) if nis != nis else estimate
+
+    def _judge(self, beyond: bool) -> None:
+        """Count measurements in a row that were not expected, and warn once of many."""
+        self._beyond = self._beyond + 1 if beyond else 0
+        if self._beyond == BEYOND:
+            warnings.warn(f"stream, step {self.steps - 1}: {self.doubt}", stacklevel=3)
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
         """Refuse implausible values, or accept the step that was flagged."""
@@ -128,7 +157,13 @@ class Stream:
     def save(self) -> bytes:
         """Return state and step number for `restore`: after it, the same pushes give the same bits."""
         leaves = {f"state.{i}": leaf for i, leaf in enumerate(self._stepper.state)}
-        head = {"steps": self.steps, "dropped": self.dropped.tolist(), "last": self._last, "of": self._placed.identity}
+        head = {
+            "steps": self.steps,
+            "dropped": self.dropped.tolist(),
+            "last": self._last,
+            "beyond": self._beyond,
+            "of": self._placed.identity,
+        }
         return packed(head, leaves)
 
     @classmethod
@@ -139,7 +174,7 @@ class Stream:
         new, (head, arrays) = cls(filter, limits, invalid), unpacked(data)
         check_same("snapshot", new._placed.identity, head.get("of", {}))
         new.steps, new.dropped = int(head["steps"]), np.array(head["dropped"], dtype=np.int64)
-        new._last = int(head.get("last", -1))
+        new._last, new._beyond = int(head.get("last", -1)), int(head.get("beyond", 0))
         new._stepper.put([arrays[f"state.{i}"] for i in range(len(new._stepper.state))])
         return new
 
@@ -182,7 +217,8 @@ class _Placed:
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
         self.state: PyTree = jax.tree.structure(self._start)
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
-        self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter.claim))
+        self.estimate: PyTree = jax.tree.structure(JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, 0.0, 0))
+        self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def stepper(self) -> NativeStepper | XlaStepper:
         """Return a stepper at the prior."""

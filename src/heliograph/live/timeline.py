@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from heliograph.filters.plausibility import in_words
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.fleet import Fleet, Options
 from heliograph.live.judging import Judges
@@ -16,7 +17,7 @@ from heliograph.live.plant_codec import plant_bytes, plant_from
 from heliograph.live.rows import BEFORE, HeldRow
 from heliograph.live.senders import SenderStatus
 from heliograph.live.snapshot import check_same, packed, unpacked
-from heliograph.model.estimate import Estimate, with_sound_claim
+from heliograph.model.estimate import Estimate, JudgedEstimate, with_sound_claim
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -184,14 +185,17 @@ class Timeline:
         self._finalise()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
-        """Return estimates at `now` by node and filter; those of several nodes are under "fused"."""
+        """Return estimates at `now` by node and filter; those of several nodes are under "fused".
+
+        Each says what its filter made of what arrived at `now`: `nis`, `received` and `refused` of `JudgedEstimate`.
+        """
         newest, now = self._plant.rows.held[-1], self.now
         if self._lanes.dt is None:
             now = np.floor(min(now, self._fleet.end_step))
         if newest.key[1] != BEFORE and now <= newest.key[0]:
-            return self._named(self._outputs(newest.slot))
+            return self._judged(self._outputs(newest.slot))
         self._fleet.look(newest, now, self._spare)
-        return self._named(self._outputs(self._spare))
+        return self._judged(self._outputs(self._spare))
 
     def senders(self) -> dict[str, SenderStatus]:
         """Return the status of each node's sender that decides when to send: what its silence means by now.
@@ -286,6 +290,20 @@ class Timeline:
         if read:
             self._finals.add(np.array([row.key[0] for row in read]), self._outputs([row.slot for row in read]))
         self._fleet.forget(results)
+
+    def _judged(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+        """Arrange the outputs of a row by node and filter, with what each filter made of what arrived there."""
+        estimates = self._named(outputs)
+        for place in self._lanes.places:
+            estimate, judged = estimates[place.node][place.filter], place.judgement or place.tested
+            if judged is not None:
+                nis, received = float(outputs[judged.distance]), int(outputs[judged.arrived])
+                reason = 0.0 if place.judgement is None else float(outputs[place.judgement.reason])
+                refused = in_words(reason, nis) if reason > 0 else ""
+                estimates[place.node][place.filter] = JudgedEstimate(
+                    estimate.mean, estimate.covariance, estimate.claim, nis, received, refused
+                )
+        return estimates
 
     def _named(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
         """Arrange outputs by node and filter."""

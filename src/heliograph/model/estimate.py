@@ -1,6 +1,7 @@
 """An estimate and what its covariance claims to be; an innovation and how likely the filter finds it."""
 
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -39,6 +40,20 @@ class Estimate(Module):
     def claims(self) -> np.ndarray:
         """The claim of each estimate, (...): "none" where mean or covariance are no numbers, or the latter is none."""
         return np.where(is_sound(self), self.claim, "none")
+
+
+@readable
+class JudgedEstimate(Estimate):
+    """An estimate on live data, and what the filter made of what arrived last.
+
+    nis: squared innovation e' S^-1 e, about `received` on average where the claim is right; NaN where nothing arrived
+    or no covariance is claimed. received: how many numbers arrived. refused: why the filter alone left them out, "" if
+    it did not.
+    """
+
+    nis: float = float("nan")
+    received: int = 0
+    refused: str = eqx.field(static=True, default="")
 
 
 @readable
@@ -99,11 +114,14 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     return sound
 
 
-def with_sound_claim(estimate: Estimate) -> Estimate:
+AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
+
+
+def with_sound_claim(estimate: AnyEstimate) -> AnyEstimate:
     """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none.
 
     Several keep theirs: `claims` says of which it holds.
     """
     if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or is_sound(estimate).all():
         return estimate
-    return Estimate(estimate.mean, estimate.covariance, "none")
+    return replace(estimate, claim="none")
