@@ -89,3 +89,32 @@ def test_events_of_several_plants_are_told_apart():
         table.recording()
     with pytest.raises(ValueError, match="plant: expected one of 'x', 'y', got 'z'"):
         table.of("z")
+
+
+def test_the_count_of_numbered_transmissions_says_what_was_lost(tmp_path):
+    """As in a timeline: nothing is known of the first and after a restart; a lost message counts for the next."""
+    sensor, rule = hg.LinearSensor([[1.0]], 0.01), hg.SendOnDelta(0.6, heartbeat=5, losses="numbered")
+    link = hg.erasure(hg.perfect(), 0.7)
+    one = hg.Network(COUNTING, {"a": hg.Node(sensor, link, {}, trigger=rule)})
+    rows = (3, 0, 0.2, np.nan), (4, 2, 0.9, 0), (7, 9, -0.1, 2), (8, 11, 0.7, 0), (0, 15, 1.4, np.nan), (2, 21, 0.5, 1)
+    (tmp_path / "events.csv").write_text(
+        "node,sequence,time,values\n" + "".join(f"a,{n},{k},{v}\n" for n, k, v, _ in rows)
+    )
+    recording, measured = hg.files.read_messages(tmp_path / "events.csv", one).rows()
+    np.testing.assert_array_equal(recording.measurements["a"][measured], [row[2:] for row in rows])
+
+
+def test_a_link_counts_what_was_lost_around_the_wrap_of_a_count():
+    """Of 4 bits, also where one had only been overtaken; of 16 a small one long before the end is a new start."""
+    from heliograph.live.plant import Link
+
+    link = Link()
+    for time, number in enumerate([13, 14, 0, 1]):
+        link.count("used", number, float(time), 16)
+    assert link.lost == 1
+    link.count("used", 15, 1.5, 16)
+    assert link.lost == 0
+    link = Link()
+    for time, number in enumerate([17, 18, 0, 1, 3]):
+        link.count("used", number, float(time), 1 << 16)
+    assert (link.lost, link.first) == (1, 0)

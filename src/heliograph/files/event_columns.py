@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.live.event import VERDICTS, Verdict
+from heliograph.live.plant import GAP
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
 
@@ -15,7 +16,6 @@ SECOND = 10**9  # nanoseconds
 YEAR = 365 * 86400 * SECOND  # a stamp that is further from its arrival was not set, or is of another clock
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
-GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
 
 
 @dataclass

@@ -14,6 +14,7 @@ from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 
 NONE = np.iinfo(np.int64).min  # of many readings: the one that has no time
 MOST_STEPS = 10_000_000  # rows of a network that counts steps
@@ -306,12 +307,27 @@ class EventTable:
                 there = ~np.isnan(values)
                 table[row[mine][there], i] = values[there]
             tables.append(table)
+        for n, name in enumerate(self.network.names):
+            self._fill_losses(name, tables[n], row, events, n)
         inputs = self._inputs(_held(tables.pop()), times)
         origin = self.origin
         time = times.astype(np.float64) if self.steps or self.numbers else (times - origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
         measured[row[events.node >= 0]] = True
         return Recording(dict(zip(self.network.names, tables, strict=True)), inputs, time), measured
+
+    def _fill_losses(
+        self, name: str, table: Float[np.ndarray, "rows received"], row: np.ndarray, events: Events, number: int
+    ) -> None:
+        """Fill in how many transmissions of a node were lost before each, by its count, where its filter expects it."""
+        if not counts_losses(self.network, name):
+            return
+        mine, column = events.node == number, self.network.nodes[name].received - 1
+        counts, rows = events.sequence[mine], row[mine]
+        gaps = np.diff(counts, prepend=counts[:1]) - 1.0
+        gaps[(gaps < 0)] = np.nan  # the first, and after a restart
+        told = np.isnan(table[rows, column]) & (min(self.columns[name].sequence, default=-1) >= 0)
+        table[rows[told], column] = gaps[told]
 
     @property
     def _joint(self) -> bool:
@@ -360,6 +376,14 @@ class EventTable:
         before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
         since = np.diff(times, prepend=times[:1]) / self._unit
         return np.insert(before, self.network.inputs.index(TIME_STEP), since, 1)
+
+
+def counts_losses(network: Network, name: str) -> bool:
+    """Return whether the last number that a node receives is how many transmissions were lost before its values."""
+    node = network.nodes[name]
+    if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
+        return False
+    return node.trigger.side_information(len(node.outputs)) == 1
 
 
 def _held(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "rows given"]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.event_table import EventTable
+from heliograph.files.event_table import EventTable, counts_losses
 from heliograph.files.fields import name_of
 from heliograph.files.message_files import FileMessage, parquet_names
 from heliograph.files.sources import Reading
@@ -54,6 +54,7 @@ class OwnMessages:
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         self.steps = TIME_STEP not in network.inputs
+        self._numbered = [name for name in network.names if counts_losses(network, name)]
         self._table: EventTable | None = None
         self._zero: int | None = None  # that whole numbers are counted from, which doubles could not tell apart
         self._zoned: bool | None = None
@@ -96,7 +97,7 @@ class OwnMessages:
         node = row[NODE]
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", shown(node))
-        values = _received(row, self.components[node], where)
+        values = _received(row, self.components[node], where, node in self._numbered)
         sequence = _whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         time, dated = self._moment(row[TIME], f"{where}, column {TIME!r}")
         arrival = time
@@ -153,11 +154,13 @@ class HeaderError(InputError):
     """The columns of a file are not those of events."""
 
 
-def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
-    """Return the values of one event."""
+def _received(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
+    """Return the values of one event; where it is `numbered` the last, of what was lost, may be left to its count."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
-        parts = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
+        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
+        if numbered and len(parts) == len(names) - 1:
+            parts.append("nan" if isinstance(cell, str) else np.nan)
         if len(parts) != len(names):
             raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", shown(cell))
         from_text = isinstance(cell, str)

@@ -87,6 +87,17 @@ class Sources:
         """Return the topics of the table, wildcards included."""
         return list(self._table)
 
+    @property
+    def periods(self) -> dict[str, int]:
+        """Return after how many messages the count of a node begins at 0 again, of nodes whose count does."""
+        mapped = [(source, places) for items in self._table.values() for source, _, places in items]
+        return {
+            node: source.sequence.period
+            for source, places in mapped
+            for node in places
+            if source.sequence is not None and source.sequence.period
+        }
+
     def of(self, topic: str) -> list[Mapped]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
         if topic not in self._known:

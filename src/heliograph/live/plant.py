@@ -11,6 +11,9 @@ from heliograph.live.rows import HeldRow, Key, Rows
 Position: TypeAlias = tuple[int, int, float, int, float]  # of a node's running count: first, newest, at, lost, latest
 
 
+GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
+
+
 @dataclass
 class Link:
     """Counts of the messages of a node by verdict, and its running count, in which gaps are lost messages.
@@ -41,9 +44,13 @@ class Link:
     dropped: int = 0
     latest: float = -1.0
 
-    def count(self, verdict: Verdict, sequence: int, time: float) -> None:
-        """Count one message. A late, implausible or future message was received too, so it fills a gap."""
+    def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
+        """Count one message. A late, implausible or future message was received too, so it fills a gap.
+
+        `period`: after how many messages the count begins at 0 again; 0 if it does not.
+        """
         setattr(self, verdict, getattr(self, verdict) + 1)
+        sequence = self._unwrapped(sequence, time, period)
         if verdict == "used":
             self.latest = max(self.latest, time)
             if sequence - 1 == self.newest >= 0 and time >= self.at:  # the next, as most are
@@ -68,6 +75,15 @@ class Link:
             self.first = sequence
         elif sequence < self.newest:
             self.lost -= self.lost > 0  # it had only been overtaken
+
+    def _unwrapped(self, sequence: int, time: float, period: int) -> int:
+        """Return a count that goes on where the node's own begins at 0 again; one that is too far is a new start."""
+        if not period or self.newest < 0:
+            return sequence
+        ahead, behind = (sequence - self.newest) % period, (self.newest - sequence) % period
+        if time >= self.at:
+            return self.newest + ahead if ahead <= GAP else sequence
+        return self.newest - behind if behind <= min(GAP, self.newest) else sequence
 
     @property
     def position(self) -> Position:

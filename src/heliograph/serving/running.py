@@ -289,6 +289,7 @@ async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     reads = None if settings.sources is None else Translator(settings.sources, settings.network)
     step = settings.options.step if reads is None else reads.sources.step
     fleet = Fleet(lanes, settings.options._replace(step=step))
+    fleet.periods = {} if reads is None else reads.sources.periods
     with signals(stop), contextlib.ExitStack() as owning:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(patiently, lambda: _open_store(settings, fleet, owning), stop)

@@ -124,7 +124,7 @@ class Using:
             notes.append(f"inputs {given}: {spoilt}; the rest is used")
         verdict: Verdict = "implausible" if why else self._take(number, plant, event, clock)
         link = plant.link(message.node)
-        link.count(verdict, message.sequence, at)
+        link.count(verdict, message.sequence, at, self.fleet.periods.get(message.node, 0))
         if dropped and verdict in ("used", "implausible"):
             link.dropped += dropped
         if beyond and verdict == "used":
