@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.disk.quoting import from_cell, in_cell
-from heliograph.files.table import TIME, columns_of, write_table
+from heliograph.files.table import TIME, as_read, columns_of, write_table
 from heliograph.model.estimate import Estimate, is_sound
 from heliograph.model.inputs import time_step_fault
 from heliograph.model.plant import TIME_STEP
@@ -107,11 +106,7 @@ def _headers(network: Network) -> dict[str, str]:
     headers |= {f"truth.{with_unit(name)}": f"truth.{name}" for name in network.states}
     headers |= {f"{node}.{with_unit(name)}": f"{node}.{name}" for node, of in received.items() for name in of}
     plain = [TIME, *headers.values()]
-    return (
-        {from_cell(in_cell(header).strip()): name for header, name in headers.items()}
-        | headers
-        | dict(zip(plain, plain, strict=True))
-    )
+    return {as_read(header): name for header, name in headers.items()} | headers | dict(zip(plain, plain, strict=True))
 
 
 def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:

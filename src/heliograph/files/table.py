@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
-from heliograph.numerics.check import InputError, fail, file_path, shown, table, unmasked
+from heliograph.numerics.check import InputError, fail, file_path, is_absent, shown, table, unmasked
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 from heliograph.numerics.types import Shaped
 
@@ -35,9 +35,10 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
     elif hasattr(table, "columns") and hasattr(table, "__getitem__"):
         frame: Any = table
         index = getattr(frame, "index", None)
-        _check_distinct(name, list(frame.columns))
-        named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in frame.columns else {}
-        named |= {column: frame[column] for column in frame.columns}
+        header = list(getattr(frame, "column_names", frame.columns))  # of pyarrow, whose columns are arrays
+        _check_distinct(name, header)
+        named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in header else {}
+        named |= {column: frame[column] for column in header}
     else:
         raise fail(name, "a file, a DataFrame, or a dictionary of columns", shown(table))
     for column in named:
@@ -85,6 +86,7 @@ def in_nanoseconds(column: np.ndarray, name: str) -> np.ndarray:
 
 def _of_objects(column: np.ndarray, name: str) -> np.ndarray:
     """Convert numbers with None among them, or dates; refuse text, even if it reads as a number."""
+    column = np.array([None if is_absent(value) else value for value in column], dtype=object)
     some = next((value for value in column if value is not None), None)
     if hasattr(some, "to_timestamp"):  # a period of pandas: its first moment
         return dates([None if value is None else value.to_timestamp() for value in column], name)
@@ -280,7 +282,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
                 commas = re.search(r"\d,\d", file.read(10_000))
             remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
             raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
-    _check_distinct(path, header)
+    _check_distinct(f"{path}, header", header)
 
 
 def _uncommented(path: Path) -> str:
@@ -314,7 +316,7 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
         table = pq.ParquetFile(path).read()
     except pa.ArrowInvalid as error:
         raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
-    _check_distinct(path, table.column_names)
+    _check_distinct(f"{path}, header", table.column_names)
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if only is not None and name not in only:
@@ -340,8 +342,14 @@ def _read_parquet(path: Path, only: Container[str] | None) -> dict[str, np.ndarr
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
+        _check_distinct(f"columns of {path}", [as_read(name) for name in columns])
         writer.writerow(map(in_cell, columns))
         writer.writerows(zip(*(_plain(c).tolist() for c in columns.values()), strict=True))
+
+
+def as_read(name: str) -> str:
+    """Return the name of a column as it reads from a CSV file to which it was written: in one line, without margins."""
+    return from_cell(in_cell(name).strip())
 
 
 def _plain(column: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, unmasked
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -144,7 +144,7 @@ def rows(
     if value is None:
         raise fail(name, f"shape ({steps}, {length})", "none")
     try:
-        values = np.asarray(value, dtype=np.float64)
+        values = np.asarray(unmasked(value), dtype=np.float64)
     except (TypeError, ValueError):
         raise fail(name, "an array of numbers", repr(value)[:60]) from None
     values = values[:, None] if values.ndim == 1 and length in (1, None) else values

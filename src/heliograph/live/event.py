@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from heliograph.numerics.check import fail, is_whole, shown
+from heliograph.numerics.check import fail, is_whole, shown, unmasked
 from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
@@ -70,7 +70,7 @@ def numbers(name: str, value: ArrayLike, size: int) -> Float[np.ndarray, " size"
     """Copy `size` real numbers, NaN where one did not arrive; a single one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
-        values = np.array(value)
+        values = np.array(unmasked(value))
         if values.dtype.kind not in "fiu":
             raise ValueError
     except ValueError:

@@ -193,7 +193,7 @@ class Stream:
 
 def _row(value: object, length: int) -> np.ndarray | None:
     """Return an array or list as `length` doubles; None for anything else, which needs a slower check."""
-    if type(value) is not np.ndarray and type(value) is not list:
+    if type(value) is not np.ndarray and (type(value) is not list or any(part is np.ma.masked for part in value)):
         return None
     try:
         row = np.asarray(value)

@@ -130,10 +130,31 @@ def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
 
 
 def unmasked(value: Any) -> Any:
-    """Return the numbers of a masked array, NaN where they are masked; anything else as it is."""
-    if not isinstance(value, np.ma.MaskedArray) or value.dtype.kind not in "fiub":
+    """Return numbers with NaN, or dates with NaT, where they are masked or missing; anything else as it is.
+
+    Masked are those of NumPy's masked arrays, also within a list, and None and NA in columns of tables.
+    """
+    if isinstance(value, list | tuple) and any(isinstance(part, np.ma.MaskedArray) for part in value):
+        value = np.ma.array([np.nan if part is np.ma.masked else part for part in value])
+    if isinstance(value, np.ma.MaskedArray):
+        numbers, masked = np.asarray(value), np.ma.getmaskarray(value)
+    elif hasattr(value, "to_numpy"):  # a column of a table, or several
+        numbers, masked = np.asarray(value), np.asarray(False)
+    else:
         return value
-    return np.where(np.ma.getmaskarray(value), np.nan, np.asarray(value, dtype=np.float64))
+    if numbers.dtype.kind == "M":
+        return np.where(masked, np.datetime64("NaT"), numbers)
+    if numbers.dtype.kind == "O":
+        absent = np.array([is_absent(part) for part in numbers.flat], dtype=bool)
+        return np.where(masked | absent.reshape(numbers.shape), np.nan, numbers)
+    if numbers.dtype.kind not in "fiub" or not masked.any():
+        return numbers
+    return np.where(masked, np.nan, numbers.astype(np.float64))
+
+
+def is_absent(value: object) -> bool:
+    """Return whether an entry of a table is none: None, NaN, or NA of pandas, which compares with nothing."""
+    return value is None or type(value).__name__ == "NAType" or (isinstance(value, float) and value != value)
 
 
 def _numbers(name: str, value: ArrayLike) -> Any:
@@ -281,7 +302,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     Whole numbers that doubles cannot tell apart stay what they are.
     """
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
-        clock: np.ndarray = np.asarray(value).astype("datetime64[ns]")
+        clock: np.ndarray = np.asarray(unmasked(value)).astype("datetime64[ns]")
         if clock.shape != (count,) or np.isnat(clock).any():
             raise fail(
                 name, f"{count} dates", f"shape {clock.shape}, {np.count_nonzero(np.isnat(clock))} of them missing"

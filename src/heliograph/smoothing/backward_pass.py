@@ -8,9 +8,10 @@ import numpy as np
 
 from heliograph.codegen.engine import compiled
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.rows import data_of
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import array, check_count, instance
+from heliograph.numerics.check import check_count, instance
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
@@ -28,7 +29,7 @@ def smoother_steps(
 
     Args:
         filter: a filter that can be smoothed.
-        measurements: rows (steps, received), NaN for what did not arrive.
+        measurements: rows (steps, received), or (steps,) of one number; NaN for what did not arrive.
         inputs: rows (steps, inputs); by default a filter without inputs is assumed.
         state: state before the first row; the filter's initial state by default.
         first_step: number of the first row's step; 0 by default.
@@ -37,9 +38,7 @@ def smoother_steps(
         ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    z = array("measurements", measurements, (None, filter.received or None), missing=True)
-    z = z if filter.received else z[:, :0]
-    u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
+    z, u = data_of(filter, measurements, inputs)
     first = np.asarray(check_count("first step", first_step, 0))
     return stepped(filter, z, u, filter.init() if state is None else state, first)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.rows import rows
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.check import array, fail, shown, unmasked
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
@@ -73,7 +73,11 @@ def _truths(network: Network, several: Sequence[object], truth: Any, steps: list
     if len(listed) != len(several) or any(single is None for single in listed):
         got = "none" if truth is True else f"{len(listed)} of them"
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
-    runs = [run for states in map(np.asarray, listed) for run in (states if states.ndim == 3 else [states])]
+    runs = [
+        run
+        for states in (np.asarray(unmasked(part)) for part in listed)
+        for run in (states if states.ndim == 3 else [states])
+    ]
     if len(runs) != len(steps):
         raise fail("truth", f"the true states of each of the {len(steps)} runs", f"{len(runs)} of them")
     return [array("truth", run, (count, len(network.states)), missing=True)
@@ -92,7 +96,7 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
     # each run: the nodes' columns side by side, and the inputs
-    runs = _runs([np.asarray(held[name]) for name in network.names])
+    runs = _runs([np.asarray(unmasked(held[name])) for name in network.names])
     results = []
     for run in runs:
         columns: list[np.ndarray] = []
