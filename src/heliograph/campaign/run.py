@@ -28,7 +28,7 @@ from heliograph.campaign.store import (
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
 from heliograph.disk.whole_file import check_output_folder, check_replaceable, clear_left, only_here
-from heliograph.numerics.check import check_count, fail, file_path, instance
+from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
@@ -86,6 +86,7 @@ def run_campaign(
         ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
     """
     instance("campaign", campaign, Campaign, "one from load_campaign")
+    check_progress(progress, "(what, done, total)")
     out, progress = file_path("results folder", out), progress or (lambda what, done, total: None)
     check_output_folder(out)
     with only_here(out) as alone:

@@ -22,7 +22,7 @@ from heliograph.model.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, shown, unmasked
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
@@ -86,15 +86,15 @@ class AbstractFilter(Module):
 
     def init(self) -> PyTree:
         """Return the state of the filter before the first step."""
-        raise NotImplementedError
+        raise unwritten(self, "init")
 
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """Predict over step k with the input u (inputs,): from the state before the step to the prior after it."""
-        raise NotImplementedError
+        raise unwritten(self, "predict")
 
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the measurement z (received,) of step k; where nothing arrived, the state stays as it is."""
-        raise NotImplementedError
+        raise unwritten(self, "correct")
 
     def estimate(self, state: PyTree) -> Estimate:
         """Return mean (n,) and covariance (n, n): the prediction after `predict`, the posterior after `correct`.
@@ -102,7 +102,7 @@ class AbstractFilter(Module):
         Raises:
             ValueError: what is no state of such a filter.
         """
-        raise NotImplementedError
+        raise unwritten(self, "estimate")
 
     def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
         """Predict over step k with the input u, then correct with the measurement z.

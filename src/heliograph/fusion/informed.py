@@ -23,6 +23,7 @@ from heliograph.fusion.weights import (
 )
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import Array, Bool, Float, PyTree
 
 Joint = Float[jax.Array, "node n node n"]
@@ -62,7 +63,7 @@ class AbstractInformedFusion(AbstractFusion):
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Return next state, fused mean and covariance, from the nodes' means after a step."""
-        raise NotImplementedError
+        raise unwritten(self, "use")
 
     def _lacking(self) -> ValueError:
         what = "the errors' joint covariance, which a Network of linear filters has"
@@ -90,11 +91,11 @@ class AbstractWeights(AbstractInformedFusion):
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
         """Compute W from P."""
-        raise NotImplementedError
+        raise unwritten(self, "weights")
 
     def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Compute W from P for those estimates that are present, zero for the others."""
-        raise NotImplementedError
+        raise unwritten(self, "arrived")
 
     def neighbour_weights(self, believed: Believed) -> Weights:
         """Weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""

@@ -13,7 +13,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
@@ -51,15 +51,18 @@ class AbstractQuantizer(Module):
 
     def init(self, n: int) -> PyTree:
         """Return the state before the first value, for values of n components."""
-        raise NotImplementedError
+        raise unwritten(self, "init")
 
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Return the next state, and what arrives of a value (n,)."""
-        raise NotImplementedError
+        raise unwritten(self, "step")
 
     def claim(self, claim: Claim) -> Claim:
-        """Claim of the widened covariance of a quantized estimate, from the claim of the estimate."""
-        raise NotImplementedError
+        """Claim of the widened covariance of a quantized estimate, from the claim of the estimate: "nominal" at most.
+
+        A quantizer whose error bounds hold whatever the data, before which they are known, may claim "upper".
+        """
+        return weakest([claim, "nominal"])
 
     def error(self, n: int) -> Float[Array, " n"]:
         """Bound on |what arrives - x| by component that holds whatever the data, where anything arrives.

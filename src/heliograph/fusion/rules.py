@@ -28,7 +28,7 @@ from heliograph.model.over_time import OverTime, first, stack
 from heliograph.model.plant import AnyPlant, angles_among
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, check_count, fail, instance, items, of_each, probabilities, scalar
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 Means = Float[jax.Array, "count n"]
@@ -56,11 +56,11 @@ class AbstractFusion(Module):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """Claim of the fused covariance, from the claims of the inputs."""
-        raise NotImplementedError
+        raise unwritten(self, "claim")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Return fused mean (n,) and covariance (n, n) of means (count, n) and covariances (count, n, n)."""
-        raise NotImplementedError
+        raise unwritten(self, "combine")
 
     @property
     def between_neighbours(self) -> bool:
@@ -137,7 +137,7 @@ class AbstractIntersection(AbstractFusion):
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
         """Weights on the simplex of estimates with these P_i and P_i^-1."""
-        raise NotImplementedError
+        raise unwritten(self, "weights_of")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Find the weights and intersect."""

@@ -18,7 +18,7 @@ from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
 from heliograph.learning.senders import SenderFit, decides, fit_sender
 from heliograph.learning.solution import Row, Solution
-from heliograph.numerics.check import check_count, check_seed, fail, scalar, shown
+from heliograph.numerics.check import check_count, check_progress, check_seed, fail, scalar, shown
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.network import Network
@@ -176,6 +176,7 @@ def fit(
     Source: Schweppe (1965) for the likelihood; Huber (1967) for intervals where it is not the true one.
     """
     check_count("starts", starts)
+    check_progress(progress, "a line of text")
     description = describe(network)
     recording, delays = _rows_and_delays(recording)
     if decides(description.start):

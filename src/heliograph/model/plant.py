@@ -13,7 +13,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_at, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, name_list, names, shown_error
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
@@ -99,7 +99,7 @@ class AbstractPlant(Module):
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u): shapes (n,), (inputs,) -> (n,)."""
-        raise NotImplementedError
+        raise unwritten(self, "transition")
 
     def noise_covariance(self, u: jax.Array) -> jax.Array:
         """Covariance of w, (n, n); it may depend on the input (a time step, a distance travelled)."""

@@ -14,7 +14,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, name_list, names, shown_error
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
@@ -42,7 +42,7 @@ class AbstractSensor(Module):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x): shapes (n,) -> (len(outputs),)."""
-        raise NotImplementedError
+        raise unwritten(self, "measure")
 
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""

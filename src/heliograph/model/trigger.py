@@ -19,7 +19,7 @@ from heliograph.numerics.check import (
     scalar,
     shown,
 )
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -81,7 +81,7 @@ class AbstractTrigger(Module):
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Decide for each component whether error = y - reference, (m,), makes it be sent at step k."""
-        raise NotImplementedError
+        raise unwritten(self, "event")
 
     def check_outputs(self, outputs: int) -> None:
         """Raise ValueError unless the rule's numbers fit so many components."""

@@ -229,6 +229,12 @@ def function(name: str, value: object, of: str) -> Any:
     return value
 
 
+def check_progress(value: object, of: str) -> None:
+    """Raise ValueError unless progress can be reported: by a function, or to nobody."""
+    if value is not None:
+        function("progress", value, of)
+
+
 def file_path(name: str, value: object) -> Path:
     """Return the path of a file or folder."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):

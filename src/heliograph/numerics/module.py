@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.names import refuse_attribute
 
 
@@ -68,6 +69,11 @@ class Module(eqx.Module):
     """
 
     __getattribute__ = object.__getattribute__
+
+
+def unwritten(owner: object, method: str) -> InputError:
+    """Build the error of a class that lacks a method which its base class leaves to it."""
+    return fail(type(owner).__name__, f"a method {method} of its own, as its base class says", "none")
 
 
 T = TypeVar("T", bound=type)

@@ -1,21 +1,22 @@
 """Random affine maps z = G y + n: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from itertools import product
 from math import prod
 from types import UnionType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.numerics.check import fail, items, shown
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, stacked
 from heliograph.numerics.types import Float, PyTree
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments.monomials import Moments
+from heliograph.random_affine.moments.monomials import Moments, count
 
 T = TypeVar("T")
 
@@ -33,15 +34,21 @@ class AbstractRandomAffine(Module):
     which are known here: a map is drawn given the states of the memories inside, one for each however often it is held.
     """
 
+    def __init_subclass__(cls, **options: object) -> None:
+        """Let a map's `moments` return the matrix alone."""
+        super().__init_subclass__(**options)
+        if (written := cls.__dict__.get("moments")) is not None:
+            type.__setattr__(cls, "moments", _with_sizes(written))
+
     @property
     def outputs(self) -> int:
         """Length of z."""
-        raise NotImplementedError
+        raise unwritten(self, "outputs")
 
     @property
     def inputs(self) -> int:
         """Length of y."""
-        raise NotImplementedError
+        raise unwritten(self, "inputs")
 
     @property
     def erases(self) -> bool:
@@ -85,7 +92,7 @@ class AbstractRandomAffine(Module):
         if self.remembers:
             raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         if type(self).sample is AbstractRandomAffine.sample:
-            raise NotImplementedError(f"{type(self).__name__}: neither sample nor draw")
+            raise unwritten(self, "sample")
         return state, self.sample(key)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -101,14 +108,14 @@ class AbstractRandomAffine(Module):
         return self.draw((), key)[1]
 
     def moments(self, order: int) -> Moments:
-        """Return the nominal E[Sym^order(H)] of a map that forgets.
+        """Return the nominal E[Sym^order(H)] of a map that forgets; a map of your own may return the matrix alone.
 
         Raises:
             ValueError: the matrix would need more than the stated memory, or the map remembers: then the moments of one
                 step say nothing of the next.
         """
         check_forgets("moments of a map", self)
-        raise NotImplementedError
+        raise unwritten(self, "moments")
 
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
         """Return the maps at the corners of the set of possible laws; the map itself when probabilities are known."""
@@ -124,11 +131,26 @@ class AbstractRandomAffine(Module):
 
     def mean_gain(self) -> "AbstractRandomAffine":
         """Return the map whose gains are constant at their means; noises stay."""
-        raise NotImplementedError
+        raise unwritten(self, "mean_gain")
 
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """Return a point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
+
+
+def _with_sizes(written: Callable[[Any, int], object]) -> Callable[[Any, int], Moments]:
+    """Return a map's `moments` that gives a matrix its sizes, and refuses one of another shape."""
+
+    @wraps(written)
+    def moments(channel: AbstractRandomAffine, order: int) -> Moments:
+        result = written(channel, order)
+        if isinstance(result, Moments):
+            return result
+        shape = count(channel.outputs + 1, order), count(channel.inputs + 1, order)
+        matrix = array(f"moments({order}) of {type(channel).__name__}", cast(Any, result), shape)
+        return Moments(matrix, channel.outputs, channel.inputs, order)
+
+    return moments
 
 
 class AbstractOfParts(AbstractRandomAffine):
@@ -250,7 +272,7 @@ class AbstractModal(AbstractRandomAffine):
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
         """Return the map, without memory, for this state of the memory."""
-        raise NotImplementedError
+        raise unwritten(self, "given")
 
 
 class Remembered(NamedTuple):

@@ -24,7 +24,7 @@ from heliograph.numerics.check import (
     report_domain,
     scalar,
 )
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import drawn_index
@@ -60,26 +60,26 @@ class AbstractMemory(Module):
 
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw the initial state."""
-        raise NotImplementedError
+        raise unwritten(self, "begin")
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
         """Draw the next state."""
-        raise NotImplementedError
+        raise unwritten(self, "move")
 
     def nodes(self, degree: int) -> Nodes:
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
-        raise NotImplementedError
+        raise unwritten(self, "nodes")
 
     def read(self, number: jax.Array) -> jax.Array:
         """The state that a number tells of."""
-        raise NotImplementedError
+        raise unwritten(self, "read")
 
     def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
         """States and weights that stand for the law of the next state given this one (None: of that at the first use).
 
         Exact for polynomials of twice the `degree` in the state.
         """
-        raise NotImplementedError
+        raise unwritten(self, "following")
 
     def labelled(self, label: str) -> "AbstractMemory":
         """Return a copy that no link refers to yet, identified by `label` alone."""

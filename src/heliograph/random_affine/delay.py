@@ -10,6 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import check_count, fail, instance, shown
+from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractOfOne, AbstractRandomAffine, as_maps
 from heliograph.random_affine.chain import MarkovChain
@@ -29,7 +30,7 @@ class AbstractOfLine(AbstractOfOne):
     @property
     def line(self) -> AbstractRandomAffine:
         """Return the same map as one without delay, whose input is the whole line."""
-        raise NotImplementedError
+        raise unwritten(self, "line")
 
     @property
     def parts(self) -> Sequence[AbstractRandomAffine]:

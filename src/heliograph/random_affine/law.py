@@ -16,7 +16,7 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics import check
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, radii, scalar
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -40,11 +40,11 @@ class AbstractLaw(Module):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one gain; shape ()."""
-        raise NotImplementedError
+        raise unwritten(self, "sample")
 
     def moment(self, order: int) -> float | jax.Array:
         """Return E[g^order] under the nominal law; traced where the law's parameters are."""
-        raise NotImplementedError
+        raise unwritten(self, "moment")
 
     def extremes(self) -> tuple["AbstractLaw", ...]:
         """Return the laws at the corners of the set of possible laws; the law itself when it is known."""

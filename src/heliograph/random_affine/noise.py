@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, shown
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.law import drawn_index
@@ -47,11 +47,11 @@ class AbstractNoise(Module):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one vector; shape (dimension,)."""
-        raise NotImplementedError
+        raise unwritten(self, "sample")
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n_1^powers[0] n_2^powers[1] ...]."""
-        raise NotImplementedError
+        raise unwritten(self, "moment")
 
 
 class Gaussian(AbstractNoise):

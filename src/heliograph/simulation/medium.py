@@ -20,7 +20,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, TRIGGER, checksum, draw_key
@@ -37,13 +37,13 @@ class AbstractMedium(Module):
 
     def init(self, key: jax.Array) -> PyTree:
         """Return the state before the first step; `key` is the run's."""
-        raise NotImplementedError
+        raise unwritten(self, "init")
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, ObservationModel]:
         """Deliver the measurements of the nodes of each group at step k, x the state to which u led; NaN for none."""
-        raise NotImplementedError
+        raise unwritten(self, "receive")
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Feed the filters' estimates back after their step, by kind, (filter, node, ...)."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.numerics.check import check_count, fail, instance, shown
+from heliograph.numerics.check import check_count, check_progress, fail, instance, shown
 from heliograph.numerics.float64 import check_process, quickly_compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
@@ -90,6 +90,7 @@ def monte_carlo(
     check_process()
     instance("network", network, Network, "a Network")
     _check_counts(horizon, runs, chunk, first_run)
+    check_progress(progress, "(done, total)")
     network.check_horizon(horizon)
     reducer = cast(AbstractReducer[Result], Trajectories()) if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")

@@ -13,7 +13,7 @@ from heliograph.codegen.engine import compiled
 from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, Float
 from heliograph.smoothing.backward_pass import carried_ahead, swept, swept_means, swept_over_lag
 
@@ -71,7 +71,7 @@ class AbstractSmoothing(Module):
 
     def sweep(self, steps: AbstractSmootherStep) -> Estimate:
         """Compute the estimates of one run, like `estimates`, inside a compiled computation."""
-        raise NotImplementedError
+        raise unwritten(self, "sweep")
 
     def means(self, steps: AbstractSmootherStep) -> jax.Array:
         """Means alone, where covariances are known from elsewhere."""

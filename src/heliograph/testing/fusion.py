@@ -100,7 +100,11 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
     Raises:
         AssertionError: naming the rule that is broken.
     """
-    generator = np.random.default_rng(seed)
+    with jax.enable_x64(True):
+        _check_steps(quantizer, n, steps, np.random.default_rng(seed))
+
+
+def _check_steps(quantizer: AbstractQuantizer, n: int, steps: int, generator: np.random.Generator) -> None:
     state = quantizer.init(n)
     structure, compiled = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
     for k in range(steps):
@@ -116,9 +120,8 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
         off = np.abs(again - sent.value)[usable] > ROUNDING * np.abs(value)[usable]
         assert not np.any(off), f"step {k}: expected what was delivered to be delivered again"
         # The same compiled and batched.
-        with jax.enable_x64(True):
-            batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
-            _, twice = compiled(*batch)
+        batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
+        _, twice = compiled(*batch)
         for name, delivered in sent._asdict().items():
             both = np.asarray(getattr(twice, name))
             same = np.allclose(both, delivered, rtol=ROUNDING, atol=0, equal_nan=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.filters.gaussian.correction import absent, gain_and_bound, gain_and_covariance
 from heliograph.numerics.linalg import add, diagonal_of, solve, summed, times, transpose, with_rounding
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.over_runs import runs_last
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
@@ -103,7 +103,7 @@ class AbstractWeights(Module):
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """w (m,) of innovations e, their squares over the innovation variance d^2, and the noise's variance r."""
-        raise NotImplementedError
+        raise unwritten(self, "weights")
 
     def iterate(
         self, before: Expected, noise: jax.Array, e: jax.Array, present: jax.Array

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.linalg import above_products, add, cholesky, symmetric, times, transpose
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array
 
@@ -35,7 +35,7 @@ class AbstractTransform(Module):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Moments of function(x) for x with mean (n,) and covariance (n, n)."""
-        raise NotImplementedError
+        raise unwritten(self, "apply")
 
 
 class Cubature(AbstractTransform):

@@ -20,7 +20,7 @@ from heliograph.filters.gaussian.correction import (
 )
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import GainAndNoise, opened
 from heliograph.random_affine.law import Discrete
@@ -53,7 +53,7 @@ class AbstractUpdate(Module):
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero."""
-        raise NotImplementedError
+        raise unwritten(self, "correct")
 
     def claim(self, uncertain: bool) -> Claim:
         """Claim of the bound behind a channel of this kind, of a filter for which all else is exact.

@@ -39,7 +39,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.linalg import symmetric
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import joint_modes
@@ -123,7 +123,7 @@ class AbstractMerging(Module):
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
         """Components and weights after a transition of the chain, before that of the plant."""
-        raise NotImplementedError
+        raise unwritten(self, "moved")
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (component, mode) of the measurement update: all that can have a weight."""

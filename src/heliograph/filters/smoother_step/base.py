@@ -29,7 +29,7 @@ from heliograph.numerics.linalg import (
     transpose,
     with_rounding,
 )
-from heliograph.numerics.module import Module
+from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int, PyTree
 
@@ -98,19 +98,19 @@ class AbstractSmootherStep(Module):
 
     def end(self) -> PyTree:
         """Start a backward pass at this step, the last."""
-        raise NotImplementedError
+        raise unwritten(self, "end")
 
     def back(self, later: PyTree, mean: jax.Array, covariance: jax.Array) -> PyTree:
         """Pass from after this step to before it, where the filter had this mean and covariance."""
-        raise NotImplementedError
+        raise unwritten(self, "back")
 
     def smoothed(self, later: PyTree) -> Moments:
         """Return the filter's state after this step, given later data."""
-        raise NotImplementedError
+        raise unwritten(self, "smoothed")
 
     def ahead(self, point: Point, covariance: jax.Array) -> Point:
         """Return an earlier state given this step's data too; the filter had this covariance before the step."""
-        raise NotImplementedError
+        raise unwritten(self, "ahead")
 
     def before(self, previous: "AbstractSmootherStep", earlier: PyTree, known: Moments) -> Moments:
         """Return the state after step `previous`, the one before this, given all later data.

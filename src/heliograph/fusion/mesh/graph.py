@@ -121,7 +121,11 @@ def neighbours_within(
     names = list(given)
     from scipy.spatial import cKDTree  # 40 ms, for those who give positions
 
-    near = cKDTree(np.array(rows)).query_ball_point(np.array(rows), reach)
+    # In a power of two as the unit, which changes no digit, and in which no square leaves the range of numbers.
+    points = np.array(rows)
+    largest = np.abs(points).max(initial=0.0)
+    unit = 2.0 ** (int(np.frexp(largest)[1]) - 1) if largest else 1.0
+    near = cKDTree(points / unit).query_ball_point(points / unit, min(reach / unit, 4.0 * (1 + points.shape[1])))
     return {
         name: tuple(names[j] for j in sorted(mine) if j != i)
         for i, (name, mine) in enumerate(zip(names, near, strict=True))

@@ -11,9 +11,9 @@ from heliograph.codegen.engine import chosen
 from heliograph.fusion.intersection import intersection_weights, trace_shares
 from heliograph.fusion.mesh.gains import Believed, Gains, Step, Weights, correct
 from heliograph.fusion.mesh.graph import Graph
-from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances
+from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
-from heliograph.numerics.check import check_count, fail, scalar, table
+from heliograph.numerics.check import InputError, check_count, fail, scalar, table
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
@@ -58,7 +58,14 @@ class TraceIntersection(AbstractIntersection):
 class _OfNeighbours(AbstractFusion):
     def claim(self, claims: list[Claim]) -> Claim:
         """Refused: a fusion centre has no neighbours."""
-        raise fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
+        raise self._alone()
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Refused likewise."""
+        raise self._alone()
+
+    def _alone(self) -> InputError:
+        return fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
 
 class DiffusionWeights(_OfNeighbours):

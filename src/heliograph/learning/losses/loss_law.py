@@ -8,7 +8,7 @@ from heliograph.learning.losses.stretches import as_fates
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.shares import Share, wilson
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -28,11 +28,11 @@ class AbstractLossLaw(Module):
 
     def shares(self) -> dict[str, Share]:
         """Estimates with their intervals, by name."""
-        raise NotImplementedError
+        raise unwritten(self, "shares")
 
     def predicted(self, fate: Packets) -> Packets:
         """Probability that each packet of a stretch is lost, given those before it."""
-        raise NotImplementedError
+        raise unwritten(self, "predicted")
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Link with such losses, which the receiver knows of.

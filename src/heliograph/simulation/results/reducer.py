@@ -11,7 +11,7 @@ from typing_extensions import TypeVar
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
-from heliograph.numerics.module import Module, readable
+from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.by_name import (
@@ -54,7 +54,7 @@ class AbstractReducer(Module, Generic[Result]):
 
     def of_step(self, step: PyTree) -> OfStep:
         """Reduce one step of one run."""
-        raise NotImplementedError
+        raise unwritten(self, "of_step")
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
         """Return the carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
@@ -65,11 +65,11 @@ class AbstractReducer(Module, Generic[Result]):
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
         """Make the result; collected parts are joined along the run axis."""
-        raise NotImplementedError
+        raise unwritten(self, "finish")
 
     def joined(self, results: Sequence[Result], network: Network) -> Result:
         """Join the results of parts of a network, each of some of its nodes with the same plant and runs."""
-        raise NotImplementedError
+        raise unwritten(self, "joined")
 
     def others(self, filtered: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
         """Return the result with that of smoothed estimates, whose claims these are, as its `smoothed`.
