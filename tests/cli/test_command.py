@@ -185,3 +185,15 @@ def test_a_refusal_in_a_process_of_its_own(folder):
 )
 def test_bad_reproductions_and_examples(folder, capsys, arguments, fragments):
     refused(folder, capsys, arguments, *fragments)
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_warning_is_a_line_of_the_command_and_names_no_source(folder, capsys):
+    """Once a call, wherever it was given: here by the file of the network."""
+    (folder / "warns.py").write_text(
+        "import warnings\nwarnings.warn('so\\nand so')\n" + (folder / "net.py").read_text()
+    )
+    assert cli.main(["check", "warns.py"]) in (0, 1)
+    assert [line for line in capsys.readouterr().err.splitlines() if "warning" in line] == [
+        "heliograph: warning: so\\nand so"
+    ]

@@ -2,8 +2,10 @@
 
 import errno
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import TextIO
 
 from cyclopts import CycloptsError
 
@@ -71,7 +73,8 @@ def _command(arguments: Sequence[str] | None) -> int:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
         with uninterrupted():  # modules in C that import it print what interrupts them
             import numpy  # noqa: F401
-        code: int | None = command(*bound.args, **bound.kwargs)
+        with _plain_warnings():
+            code: int | None = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
         return code or 0
     except CycloptsError as error:
@@ -91,6 +94,27 @@ def _command(arguments: Sequence[str] | None) -> int:
         if extra is None:
             raise
         return _refuse(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print warnings to users as lines of the command, without the place in the source that gave them."""
+    with warnings.catch_warnings():
+        of_python = warnings.showwarning
+
+        def show(
+            message: Warning | str, category: type[Warning], filename: str, lineno: int,
+            file: TextIO | None = None, line: str | None = None,
+        ) -> None:  # fmt: skip
+            if issubclass(category, UserWarning):
+                from heliograph.disk.quoting import visible
+
+                print(f"heliograph: warning: {visible(str(message))}", file=sys.stderr if file is None else file)
+            else:
+                of_python(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        yield
 
 
 def _output_is_lost() -> bool:
