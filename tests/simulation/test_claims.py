@@ -144,6 +144,7 @@ def test_a_filter_alone_keeps_its_claim():
     assert hg.Stream(item).push([0.0]).claim == "exact"
 
 
+@pytest.mark.slow
 def test_the_word_goes_wherever_the_claim_goes(tmp_path):
     """Filtered, smoothed, lagged, fused; records, statistics, tables; streams, timelines, C; single precision."""
     nodes = {n: hg.Node(SENSOR, hg.perfect(), {"f": KALMAN}, trigger=hg.SendOnDelta(0.5)) for n in "ab"}
@@ -161,3 +162,120 @@ def test_the_word_goes_wherever_the_claim_goes(tmp_path):
     assert hg.Stream(network.nodes["a"].filters["f"]).push([0.0]).claim == "nominal"
     hg.export_c(network.nodes["a"].filters["f"], tmp_path / "step.c")
     assert "Claim: nominal" in (tmp_path / "step.h").read_text()
+
+
+class World:
+    """Plant, sensor, link and sender of a node, built anew from numbers whenever asked for."""
+
+    def __init__(self, numbers):
+        self.numbers = dict(numbers)
+
+    def changed(self, part, generator):
+        """Another world that differs in one number alone."""
+        value = self.numbers[part]
+        other = (
+            generator.integers(1, 3)
+            if isinstance(value, int)
+            else value * (0.7 if part == "radius" else generator.choice([0.7, 1.4]))
+        )
+        return World(self.numbers | {part: other + value * isinstance(value, int)})
+
+    @property
+    def plant(self):
+        n = self.numbers
+        return hg.LinearPlant(
+            [[n["drift"], 0.1], [0.0, 0.8]], n["noise"] * np.eye(2), [n["start"], 0.0], n["spread"] * np.eye(2)
+        )
+
+    @property
+    def sensor(self):
+        return hg.LinearSensor([[self.numbers["gain"], 0.5]], self.numbers["error"])
+
+    @property
+    def link(self):
+        n = self.numbers
+        hop = hg.hop(hg.random_affine.Rician(n["sight"], n["scatter"]), n["hop_noise"])
+        second = hg.hop(n["relay"], 0.2)
+        kinds = {
+            "hop": lambda: hop,
+            "relay": lambda: hg.amplify_and_forward([hop, second]),
+            "dropout": lambda: hg.dropout(second, n["arrival"]),
+            "radius": lambda: hg.dropout(second, n["arrival"], n["radius"]),
+            "memory": lambda: hg.gilbert_elliott(hop, second, n["fail"], n["recover"]),
+            "late": lambda: hg.model.delayed(hop, hg.Discrete([0, 1], [n["arrival"], 1 - n["arrival"]])),
+            "constant": lambda: hg.model.delayed(hop, n["delay"]),
+        }
+        return kinds[n["kind"]]()
+
+
+OF_LINK = {
+    "hop": ["sight", "scatter", "hop_noise"], "relay": ["sight", "scatter", "hop_noise", "relay"],
+    "dropout": ["arrival", "relay"], "radius": ["arrival", "relay", "radius"],
+    "memory": ["sight", "hop_noise", "fail", "recover", "relay"], "late": ["sight", "arrival", "hop_noise"],
+    "constant": ["sight", "delay"],
+}  # fmt: skip
+OF_NODE = ["drift", "noise", "start", "spread", "gain", "error"]
+PART = dict.fromkeys(OF_NODE[:4], "plant") | dict.fromkeys(OF_NODE[4:], "sensor")
+
+
+def drawn(generator):
+    return World({
+        **{name: float(generator.uniform(0.2, 0.7)) for name in
+           ("drift", "noise", "start", "spread", "gain", "error", "sight", "scatter", "hop_noise", "relay", "arrival")},
+        "fail": float(generator.uniform(0.05, 0.3)), "recover": float(generator.uniform(0.2, 0.5)), "radius": 0.05,
+        "delay": int(generator.integers(1, 3)), "kind": str(generator.choice(list(OF_LINK))),
+    })  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_of_random_worlds_only_the_filters_own_keeps_its_claim(seed):
+    """25 worlds each, with a filter for that world, built again, and one for a world that differs in one number."""
+    generator = np.random.default_rng(seed)
+    for _ in range(25):
+        world = drawn(generator)
+        part = str(generator.choice(OF_NODE + OF_LINK[world.numbers["kind"]]))
+        other = world.changed(part, generator)
+        right, wrong = (hg.linear_filter(w.plant, w.sensor, w.link) for w in (world, other))
+        node = hg.Node(world.sensor, world.link, {"right": right, "wrong": wrong})
+        network = hg.Network(world.plant, {"a": node})
+        assert right.claim in STRONG and wrong.claim in STRONG
+        assert network.claims()["a"] == {"right": right.claim, "wrong": "nominal"}, (world.numbers, part)
+        assert [(b.filter, b.parts) for b in beliefs(network)] == [("wrong", (PART.get(part, "channel"),))]
+
+
+def test_a_filter_that_does_not_say_what_it_believes_claims_nothing():
+    system = hg.linear.lifted_system(PLANT, SENSOR, LINK, 1, 4)
+    said = hg.filters.LinearSystemFilter(system)
+    bare = hg.linear.LinearSystem(system.steps, system.mean, system.covariance, system.projection)
+    network = network_of(LINK, said)
+    assert network.claims() == {"a": {"f": "exact"}} and list(beliefs(network)) == []
+    network = network_of(LINK, hg.filters.LinearSystemFilter(bare))
+    assert network.claims() == {"a": {"f": "nominal"}}
+    assert [b.words for b in beliefs(network)] == ["filter 'f' believes something that it does not say at node 'a'"]
+
+
+def relayed(gain=1.0, own=0.1):
+    plant, sensor = rebuilt()
+    slots = [{"relay": {"sensor": hg.hop(gain, own)}, "receiver": {"relay": hg.hop(0.5, 0.1)}}]
+    return hg.model.RelayNetwork(plant, sensor, ["relay"], slots)
+
+
+def of_relays(world, believed, of_receiver):
+    schedules = hg.relays.relay_schedules(believed, hg.relays.local_error_design(believed, 4))
+    local = hg.filters.ScheduledFilter(schedules.pop("receiver"))
+    gains = hg.relays.local_error_design(of_receiver, 4).gains
+    best = hg.filters.LinearSystemFilter(hg.relays.receiver_system(of_receiver, gains))
+    return hg.Network.of_relays(world, schedules, {"local": local, "best": best}).claims()
+
+
+@pytest.mark.slow
+def test_relays_and_their_receiver_believe_hops_and_the_gains_that_run():
+    assert of_relays(relayed(), relayed(), relayed()) == {
+        "relay": {"local": "exact"}, "receiver": {"local": "exact", "best": "exact"},
+    }  # fmt: skip
+    assert of_relays(relayed(), relayed(2.0), relayed(2.0)) == {
+        "relay": {"local": "nominal"}, "receiver": {"local": "nominal", "best": "nominal"},
+    }  # fmt: skip
+    others = of_relays(relayed(), relayed(), relayed(own=0.4))
+    assert others["receiver"] == {"local": "exact", "best": "nominal"}

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from heliograph.model.channel import Channel, parallel
-from heliograph.model.enlarged import JointSensor, joint_sensor
+from heliograph.model.enlarged import JointSensor, joint_sensor, with_past
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
@@ -41,7 +41,7 @@ def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         believed: what the filter was made for.
         own: plant, sensor, channel and trigger of the place where it stands.
     """
-    order = believed.order
+    order, own = believed.order, _as_enlarged(believed, own)
     parts = [] if _at_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
         agree = same(believed.relays, own.relays) and _same_gains(believed, own)
@@ -60,6 +60,16 @@ def differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     if _at_all_steps(_same_observation, *observations, order):
         return tuple(parts)
     return tuple(parts + [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree])
+
+
+def _as_enlarged(believed: Premise, own: Premise) -> Premise:
+    """The world with its past signals as states, where the filter was made for these: of them it tells the first."""
+    if own.sensor is None or own.channel is None or not first(own.channel).past:
+        return own
+    if len(first(believed.plant).states) <= len(first(own.plant).states):
+        return own
+    plant, sensor, channel = with_past(own.plant, own.sensor, own.channel)
+    return own.replaced(plant=plant, sensor=sensor, channel=channel)
 
 
 def joined(premises: Sequence[Premise]) -> Premise:
