@@ -44,6 +44,7 @@ bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/result
 
 soak: .venv/.test  ## Kill a service fifty times; try ten thousand random networks (an hour or more; goes on where stopped)
 	@$(BIN)/python benchmarks/kills.py
+	@$(BIN)/python benchmarks/upper_claims.py
 	@$(BIN)/python benchmarks/soak.py
 
 clean:  ## Remove the environment and everything made by the other targets

@@ -1,0 +1,35 @@
+"""A short search for a broken claim of "upper"; benchmarks/upper_claims.py makes a long one."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+import heliograph as hg
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+STEPS = 3
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def search(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    return importlib.import_module("upper_claims")
+
+
+def test_no_claim_is_broken(search):
+    for name, ratio in search.families().items():
+        assert search.ascended(ratio, 0, STEPS).largest <= 1 + search.ROUNDING, name
+
+
+def test_the_search_finds_a_rule_that_is_no_bound(search, monkeypatch):
+    """`ZeroMean`, as if it claimed "upper"."""
+    monkeypatch.setattr(hg.filters.ZeroMean, "claim", lambda rule, uncertain: "upper" if uncertain else "exact")
+    monkeypatch.setitem(search.RULES, "zero mean", lambda read: hg.filters.ZeroMean())
+
+    def ratio(numbers):
+        return search.ratio_of(search.behind_a_link("a hop", "zero mean")(numbers))
+
+    assert search.ascended(ratio, 2, 20).largest > 1.1
