@@ -1,7 +1,10 @@
+from itertools import product
+
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.learning.losses.loss_law import IndependentLosses, MarkovLosses
 
 
 def listed(fates):
@@ -58,3 +61,55 @@ def test_numbers_must_be_whole(numbers):
 def test_fates_are_checked(fates):
     with pytest.raises(ValueError, match="fates: expected"):
         hg.learning.learn_losses(fates)
+
+
+def sessions(rng, count, packets, fail, recover):
+    """Numbers that arrive of a sender that restarts after so many packets; losses of a chain in its stationary law."""
+    numbers = []
+    for session in range(count):
+        lost = rng.random() < fail / (fail + recover)
+        for k in range(packets):
+            if not lost:
+                numbers.append(1000 * session + k)
+            lost = rng.random() >= recover if lost else rng.random() < fail
+    return numbers
+
+
+def test_ends_of_a_stretch_are_no_trials():
+    """Thirty recordings of a sender that restarts every ten packets: the mean is within four standard errors of .3."""
+    estimates, held = [], 0
+    for seed in range(30):
+        numbers = sessions(np.random.default_rng(seed), 60, 10, 0.3, 0.7)
+        share = IndependentLosses.fit(hg.learning.fates_of_sequence(numbers)).shares()["loss"]
+        estimates.append(share.estimate)
+        held += share.low < 0.3 < share.high
+    assert abs(np.mean(estimates) - 0.3) < 4 * np.std(estimates) / np.sqrt(30)
+    assert held >= 25  # fewer has a probability of 1e-3 where each holds with 95 %
+
+
+def test_the_laws_of_losses_take_them():
+    """The share of losses among the packets between ends, and laws that are judged on the later ones."""
+    numbers = sessions(np.random.default_rng(5), 60, 10, 0.3, 0.7)
+    learned = hg.learning.learn_losses(hg.learning.fates_of_sequence(numbers))
+    spans = [np.diff(part) for part in np.split(numbers, np.flatnonzero(np.diff(numbers) > 200) + 1)]
+    assert learned.lost == sum(int(np.sum(gaps - 1)) for gaps in spans)
+    assert learned.packets == sum(int(gaps.sum()) - 1 for gaps in spans if len(gaps))
+    assert not learned.memory.significant
+
+
+def test_bursts_are_those_of_a_chain_that_is_known_to_end_arrived():
+    """Of 1500 restarts, within the 95 % intervals of both shares."""
+    fates = hg.learning.fates_of_sequence(sessions(np.random.default_rng(0), 1500, 10, 0.1, 0.3))
+    shares = MarkovLosses.fit(fates).shares()
+    assert shares["fail"].low < 0.1 < shares["fail"].high and shares["recover"].low < 0.3 < shares["recover"].high
+
+
+def test_fates_between_two_arrivals_have_all_the_probability():
+    """Over all 2^5 fates of five packets between two that arrived."""
+    fates = hg.learning.fates_of_sequence(sessions(np.random.default_rng(1), 40, 10, 0.1, 0.3))
+    for law in (IndependentLosses.fit(fates), MarkovLosses.fit(fates)):
+        total = 0.0
+        for between in product([False, True], repeat=5):
+            numbers = [0, *(np.flatnonzero(~np.array(between)) + 1), 6]
+            total += np.exp(np.nansum(law.log_likelihoods(hg.learning.fates_of_sequence(numbers))))
+        assert total == pytest.approx(1.0, abs=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
-from heliograph.learning.losses.stretches import Fates, as_fates
+from heliograph.learning.losses.stretches import CHOSEN, Fates, as_fates, as_history, ends_alone
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -43,9 +43,19 @@ class HiddenModeLosses(AbstractLossLaw):
         Raises:
             ValueError: what is no fates.
         """
-        runs = Runs.of(as_fates(fates))
-        top, value = maximum(runs.likelihood, [*STARTS])
-        good, bad, fails, recovers = shares_at(runs.likelihood, top, value, intervals)
+        parts = as_fates(fates)
+        chosen = [ends_alone(fate) for fate in parts if fate[-1] == CHOSEN]
+        whole, ends = Runs.of([as_history(fate) for fate in parts]), Runs.of(chosen) if chosen else None
+
+        def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = whole.likelihood(x)
+            if ends is None:
+                return value, slope
+            given, by_ends = ends.likelihood(x)
+            return value - given, slope - by_ends
+
+        top, value = maximum(likelihood, [*STARTS])
+        good, bad, fails, recovers = shares_at(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:
             good, bad, fails, recovers = bad, good, recovers, fails
         return HiddenModeLosses(good, bad, fails, recovers)

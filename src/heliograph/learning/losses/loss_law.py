@@ -4,7 +4,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from heliograph.learning.losses.stretches import as_fates
+from heliograph.learning.losses.shares import logits, maximum
+from heliograph.learning.losses.stretches import CHOSEN, Fates, as_fates, as_history, is_trial
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
@@ -23,7 +24,9 @@ class AbstractLossLaw(Module):
     """Law of observed losses. Subclasses define `shares`, `predicted`, and `channel` where one has such losses.
 
     The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;
-    each stretch starts in the stationary law.
+    each stretch starts in the stationary law. Of a stretch between two packets that are its ends because they arrived
+    (`fates_of_sequence`) it is that of the packets between, given that both ends arrived:
+    log P(fates) - log P(ends), where P(ends) is the probability that the two arrive, whatever became of the others.
     """
 
     def shares(self) -> dict[str, Share]:
@@ -45,14 +48,27 @@ class AbstractLossLaw(Module):
     def log_likelihoods(self, fates: object) -> Packets:
         """Log-likelihood log P(fate | those before), packet by packet, of all stretches; NaN where the fate is unknown.
 
+        A last packet that is an end because it arrived has log P(arrived | those before) - log P(arrived | the first).
+
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
         """
         parts = as_fates(fates)
-        lost, p = np.concatenate(parts), np.concatenate([self.predicted(stretch) for stretch in parts])
+        return np.concatenate([self._log_likelihood(stretch) for stretch in parts])
+
+    def _log_likelihood(self, fate: Packets) -> Packets:
+        p = self.predicted(as_history(fate))
         with np.errstate(divide="ignore"):
-            logs: Packets = np.where(np.isnan(lost), np.nan, np.where(lost == 1, np.log(p), np.log1p(-p)))
+            logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
+        if fate[-1] == CHOSEN and len(fate) > 2:
+            logs[-1] = np.log1p(-p[-1]) - np.log(self._arrives_again(len(fate) - 1))
         return logs
+
+    def _arrives_again(self, steps: int) -> float:
+        """Probability that a packet arrives so many after one that did, whatever became of those between."""
+        fate = np.full(steps + 1, np.nan)
+        fate[0] = 0.0
+        return 1.0 - float(self.predicted(fate)[-1])
 
 
 class IndependentLosses(AbstractLossLaw):
@@ -74,7 +90,7 @@ class IndependentLosses(AbstractLossLaw):
             ValueError: what is no fates.
         """
         known = np.concatenate(as_fates(fates))
-        return IndependentLosses(int(np.nansum(known)), int(np.sum(~np.isnan(known))))
+        return IndependentLosses(int(np.sum(known == 1)), int(np.sum(is_trial(known))))
 
     def shares(self) -> dict[str, Share]:
         """Share of losses, lost / packets, with Wilson's interval."""
@@ -103,17 +119,24 @@ class MarkovLosses(AbstractLossLaw):
     def fit(fates: object, order: int = 1) -> "MarkovLosses":
         """Count, over packets of which the last `order` fates are known.
 
+        Between ends that arrived for being ends the chain is one given its end. For order 1 the counts are then such
+        that their shares are the maximum of that likelihood, with as many packets as know as much; for higher orders
+        packets between the ends are counted.
+
         Raises:
             ValueError: what is no fates, or an order that is not from 1 to 12.
         """
         if check_count("order", order) > 12:
             raise fail("order", "at most 12 packets back", order)
         counts = np.zeros((2**order, 2))
-        for stretch in as_fates(fates):
-            past, length = _past(stretch, order)
-            full = (length == order) & ~np.isnan(stretch)
-            np.add.at(counts, (past[full], stretch[full].astype(int)), 1.0)
-        return MarkovLosses(counts)
+        parts = as_fates(fates)
+        for stretch in parts:
+            past, length = _past(as_history(stretch), order)
+            # where a chain is counted given its end, the step to the end counts as well
+            full = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
+            np.add.at(counts, (past[full], as_history(stretch)[full].astype(int)), 1.0)
+        spans = _spans(parts)
+        return MarkovLosses(_given_ends(counts, spans) if order == 1 and len(spans) else counts)
 
     @property
     def order(self) -> int:
@@ -139,6 +162,12 @@ class MarkovLosses(AbstractLossLaw):
             probabilities[here] = p[past[here] & (2**known - 1)]
         return probabilities
 
+    def _arrives_again(self, steps: int) -> float:
+        if self.order > 1:
+            return super()._arrives_again(steps)
+        a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]
+        return float((b + a * (1 - a - b) ** steps) / (a + b))
+
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Link in modes that are the last fates; a past that was never seen is taken for even odds."""
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
@@ -152,6 +181,41 @@ class MarkovLosses(AbstractLossLaw):
         transition[now, (now << 1) & (len(p) - 1)] += 1 - p
         transition[now, ((now << 1) | 1) & (len(p) - 1)] += p
         return markov_fading([lost if mode & 1 else arrives for mode in now], MarkovChain(transition))
+
+
+def _spans(parts: Fates) -> np.ndarray:
+    """Steps from the first to the last packet of stretches between arrivals."""
+    return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
+
+
+def _given_ends(counts: np.ndarray, spans: np.ndarray) -> np.ndarray:
+    """Counts whose shares are the most likely fail a and recover b of chains that are known to end arrived.
+
+    l = sum n log p - sum_spans log P_m, P_m = (b + a (1 - a - b)^m) / (a + b) the probability to arrive again after m
+    steps. A count in all is p (1 - p) / variance of p: as many packets as would know as much alone.
+    """
+
+    def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+        a, b = shares = 1 / (1 + np.exp(-x))
+        kept = 1 - a - b
+        power, slope = kept**spans, -spans * kept ** (spans - 1.0)
+        again, total = b + a * power, a + b
+        by_a = (power + a * slope) / again - 1 / total
+        by_b = (1 + a * slope) / again - 1 / total
+        (stayed, failed), (recovered, lost) = counts
+        value = stayed * np.log1p(-a) + failed * np.log(a) + recovered * np.log(b) + lost * np.log1p(-b)
+        score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
+        return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
+
+    top, _ = maximum(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    shares = 1 / (1 + np.exp(-top))
+    # variances of the logits, 1 / (n p (1 - p)) of n packets alone, from differences of the score
+    steps = 1e-4 * np.eye(2)
+    hessian = np.stack([likelihood(top - step)[1] - likelihood(top + step)[1] for step in steps]) / 2e-4
+    variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
+    size = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
+    fails, recovers = shares
+    return np.asarray(size[:, None] * np.array([[1 - fails, fails], [recovers, 1 - recovers]]))
 
 
 def _past(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from heliograph.learning.intervals import mean_and_error
 from heliograph.learning.losses.hidden_losses import HiddenModeLosses
 from heliograph.learning.losses.loss_law import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
 from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
-from heliograph.learning.losses.stretches import Fates, as_fates
+from heliograph.learning.losses.stretches import CheckedFates, Fates, as_fates, as_history, is_trial
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -100,11 +100,11 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     share = float(scalar("held-out share", held_out, 0.0, 1.0))
     if share == 1.0:
         raise fail("held-out share", "less than 1: something must be fitted", share)
-    known = ~np.isnan(np.concatenate(parts))
+    known = is_trial(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
     held_out_scores = _held_out_scores(parts, known, cut) if 0 < cut < known.sum() else {}
     best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
-    lost = int(np.nansum(np.concatenate(parts)))
+    lost = int(np.sum(np.concatenate(parts) == 1))
     return Losses(int(known.sum()), lost, _fitted(parts, True), loss_memory(parts), held_out_scores, best)
 
 
@@ -124,7 +124,7 @@ def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Hel
     late = known & (np.cumsum(known) > cut)
     early = np.where(late, np.nan, everything)
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
-    laws = _fitted(np.split(early, ends), False)
+    laws = _fitted(CheckedFates(np.split(early, ends)), False)
     said = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     scores = {}
     for name, logs in said.items():
@@ -149,7 +149,8 @@ def loss_memory(fates: object) -> LossMemory:
     # Wald and Wolfowitz: runs less their mean, given the number of losses, and their variance
     off, variance = 0.0, 0.0
     for stretch in as_fates(fates):
-        for lost in _unbroken(stretch):
+        # of a stretch between arrivals the packets between them, which are exchangeable if losses are independent
+        for lost in _unbroken(np.where(is_trial(stretch), stretch, np.nan)):
             n, ones = len(lost), float(lost.sum())
             pairs = 2 * ones * (n - ones)
             off += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
@@ -196,12 +197,13 @@ class RunningRateLosses(AbstractLossLaw):
             ValueError: what is no fates.
         """
         parts = [stretch[~np.isnan(stretch)] for stretch in as_fates(fates)]
+        trials, parts = [is_trial(stretch) for stretch in parts], [as_history(stretch) for stretch in parts]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             share = expit(x)
             ahead = [_ahead(stretch, *share) for stretch in parts]
             value, slope = (
-                sum(column) for column in zip(*(_log(*a) for a in zip(parts, ahead, strict=True)), strict=True)
+                sum(column) for column in zip(*(_log(*a) for a in zip(parts, ahead, trials, strict=True)), strict=True)
             )
             return float(value), np.asarray(slope * share * (1 - share))
 
@@ -229,7 +231,8 @@ def _ahead(lost: Packets, base: float, weight: float, step: float) -> tuple[Pack
     return base + weight * rate, np.stack([1 + weight * by_base, rate, weight * by_step])
 
 
-def _log(lost: Packets, ahead: tuple[Packets, Packets]) -> tuple[float, np.ndarray]:
+def _log(lost: Packets, ahead: tuple[Packets, Packets], trials: np.ndarray) -> tuple[float, np.ndarray]:
     p, slope = ahead
     p = np.clip(p, 1e-300, 1 - 1e-16)
-    return float(np.sum(np.where(lost == 1, np.log(p), np.log1p(-p)))), slope @ ((lost - p) / (p * (1 - p)))
+    logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
+    return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)

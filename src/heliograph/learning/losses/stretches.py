@@ -6,13 +6,54 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, check_count, fail, items, rank, table
-from heliograph.numerics.types import ArrayLike, Float, Shaped
+from heliograph.numerics.types import ArrayLike, Bool, Float, Shaped
 
 Fates = list[Float[np.ndarray, " packets"]]
 
+
+class CheckedFates(Fates):
+    """Stretches as `as_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
+
+
 JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
+CHOSEN = 2.0  # of a packet that arrived, and is an end of its stretch for that reason
 COPY = 50  # a number received again within so many is a copy
 MOST = 2.0**53  # whole numbers up to here are doubles
+
+
+class BetweenArrivals(np.ndarray):
+    """Fates of a stretch that begins and ends where a packet arrived: these ends are no trials, being chosen for it.
+
+    Only the array itself is: of its slices, copies and sums nothing is said.
+    """
+
+    chosen = False
+
+    def __array_finalize__(self, source: Any) -> None:
+        """Make no claim for what is derived from an array."""
+        self.chosen = False
+
+    @staticmethod
+    def of(fates: np.ndarray) -> "BetweenArrivals":
+        """Mark fates (packets,)."""
+        marked = fates.view(BetweenArrivals)
+        marked.chosen = True
+        return marked
+
+
+def is_trial(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
+    """Packets whose fate is known and was not what made them an end."""
+    return np.asarray((fate == 0) | (fate == 1))
+
+
+def as_history(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Fates as far as they are known to those after them: ends have arrived."""
+    return np.where(fate == CHOSEN, 0.0, fate)
+
+
+def ends_alone(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """A stretch of which nothing is known but that its chosen ends arrived."""
+    return np.where(fate == CHOSEN, 0.0, np.nan)
 
 
 def fates_of_sequence(
@@ -23,6 +64,9 @@ def fates_of_sequence(
     A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted); a copy is dropped.
     Packets that overtake each other look like restarts: with their times of sending they are put in order first, and a
     copy is what has number and time of another.
+
+    The first and the last packet of a stretch are its ends because they arrived: they are no trials (for `learn_losses`
+    and the laws of losses), though those between them are, given that both arrived.
 
     Args:
         sequence: sequence numbers in the order of arrival (packets,).
@@ -55,10 +99,10 @@ def fates_of_sequence(
     return [_gaps(np.array(numbers)) for numbers in stretches]
 
 
-def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:
+def _gaps(received: np.ndarray) -> BetweenArrivals:
     lost = np.ones(received[-1] - received[0] + 1)
     lost[received - received[0]] = 0.0
-    return lost
+    return BetweenArrivals.of(lost)
 
 
 def fates_by_node(
@@ -144,11 +188,13 @@ def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *r
 
 
 def as_fates(value: object) -> Fates:
-    """Check and list stretches of fates, given one or several.
+    """Check and list stretches of fates, given one or several; CHOSEN stands for ends that are no trials.
 
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
+    if isinstance(value, CheckedFates):
+        return value
     listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
     items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
     several = len(items) > 0 and all(rank("fates", x) == 1 for x in items)
@@ -158,6 +204,14 @@ def as_fates(value: object) -> Fates:
             raise fail(
                 "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
             )
-    if not any(np.any(~np.isnan(stretch)) for stretch in parts):
-        raise fail("fates", "at least one packet of which the fate is known", "none")
-    return [stretch for stretch in parts if len(stretch)]
+    chosen = [getattr(x, "chosen", False) for x in (items if several else [value])]
+    fates = CheckedFates(_with_ends(f) if c else f for f, c in zip(parts, chosen, strict=True) if len(f))
+    if not any(np.any(is_trial(fate)) for fate in fates):
+        raise fail("fates", "at least one packet of which the fate is known and that is no end of its stretch", "none")
+    return fates
+
+
+def _with_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    ends = np.zeros(len(fate), dtype=bool)
+    ends[[0, -1]] = True
+    return np.where(ends, CHOSEN, fate)
