@@ -12,29 +12,45 @@ from heliograph.numerics.check import fail
 
 Real = Literal["double", "float"]
 
-INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^",
-    "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
-}  # fmt: skip
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^"}
+ORDER = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+# Orders of floating-point numbers: operators would raise a flag at NaN, which is a component that did not arrive.
+QUIET = {"lt": "isless", "le": "islessequal", "gt": "isgreater", "ge": "isgreaterequal"}
 # Functions of libm by the operation's name; in single precision they end in f.
 FUNCTIONS = {name: name for name in (
     "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan2", "pow", "floor", "ceil", "asin",
-    "acos", "atan", "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "erf", "erfc", "nextafter",
-)} | {"abs": "fabs", "rem": "fmod", "round_even": "nearbyint"}  # fmt: skip
+    "acos", "atan", "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "erf", "erfc", "lgamma",
+)} | {"abs": "fabs", "rem": "fmod", "round_even": "nearbyint", "round_away": "round"}  # fmt: skip
 # What is more than one operator or function; a and b are names or literals, never expressions.
 COMPOSED: dict[str, Callable[..., str]] = {
     "neg": "-{0}".format,
-    "max": "({0} > {1} || {0} != {0} ? {0} : {1})".format,
-    "min": "({0} < {1} || {0} != {0} ? {0} : {1})".format,
-    "sign": "({0} > 0 ? 1 : {0} < 0 ? -1 : {0})".format,
+    "max": "(isgreater({0}, {1}) || {0} != {0} || ({0} == {1} && !signbit({0})) ? {0} : {1})".format,
+    "min": "(isless({0}, {1}) || {0} != {0} || ({0} == {1} && signbit({0})) ? {0} : {1})".format,
+    "sign": "(isgreater({0}, 0) ? 1 : isless({0}, 0) ? -1 : {0})".format,
     "is_finite": "!!isfinite({0})".format,
-    "select": "({0} ? {1} : {2})".format,
 }
+# Operations on integers, of b bits: {t} the type, {u} that without a sign. What C leaves undefined is JAX's: numbers
+# wrap around, a division by zero has all bits, a shift by all bits leaves nothing or the sign.
 WHOLE: dict[str, Callable[..., str]] = {
-    "div": "({1} ? {0} / {1} : -1)".format,
-    "rem": "({1} ? {0} % {1} : {0})".format,
-    "abs": "({0} < 0 ? -{0} : {0})".format,
+    "add": "({t})(({u}){0} + ({u}){1})".format,
+    "sub": "({t})(({u}){0} - ({u}){1})".format,
+    "mul": "({t})(({u}){0} * ({u}){1})".format,
+    "neg": "({t})(0 - ({u}){0})".format,
+    "abs": "({0} < 0 ? ({t})(0 - ({u}){0}) : {0})".format,
     "sign": "(({0} > 0) - ({0} < 0))".format,
+    "max": "({0} > {1} ? {0} : {1})".format,
+    "min": "({0} < {1} ? {0} : {1})".format,
+    "div": "({1} == 0 ? -1 : {1} == -1 ? ({t})(0 - ({u}){0}) : {0} / {1})".format,
+    "rem": "({1} == 0 ? {0} : {1} == -1 ? 0 : {0} % {1})".format,
+    "shift_left": "(({u}){1} < {b} ? ({t})(({u}){0} << {1}) : 0)".format,
+    "shift_right": "(({u}){1} < {b} ? ({t})(({u}){0} >> {1}) : 0)".format,
+    "shift_right_signed": "({t})(({s}){0} < 0 ? ~(~({s}){0} >> {by}) : ({s}){0} >> {by})".format,
+}
+UNSIGNED: dict[str, Callable[..., str]] = {
+    "div": "({1} ? {0} / {1} : ({t})-1)".format,
+    "rem": "({1} ? {0} % {1} : {0})".format,
+    "abs": "{0}".format,
+    "sign": "({0} != 0)".format,
 }
 
 
@@ -53,8 +69,10 @@ def literal(value: float | int | bool, type: Type, real: Real) -> str:
     if type == "bool":
         return "1" if value else "0"
     if type != "f64":
-        text = f"{int(value)}{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
-        return f"({text})" if value < 0 else text
+        ending = f"{'u' if type[0] == 'u' else ''}{'ll' if type[1:] == '64' else ''}"
+        if value >= 0:
+            return f"{int(value)}{ending}"
+        return f"({int(value) + 1}{ending} - 1)"  # of the least number C has no literal
     # Floating-point numbers: the shortest text that reads back as the same number.
     if math.isnan(value):
         return "NAN"
@@ -77,23 +95,64 @@ def expression(node: Node, arguments: Sequence[str], real: Real) -> str:
     Raises:
         Unsupported: an operation that C does not have.
     """
-    op, whole = node.op, node.type != "f64"
-    if op == "convert":
-        if node.type == "bool":
-            return f"({arguments[0]} != 0)"
-        return f"({c_type(node.type, real)}){arguments[0]}"
+    op, source = node.op, node.args[0].type
+    if op == "select":
+        return f"({arguments[0]} ? {arguments[1]} : {arguments[2]})"
+    if op in ("convert", "bitcast"):
+        return (_converted if op == "convert" else _as_other)(source, node.type, arguments[0], real)
     if op == "not":
-        return f"!{arguments[0]}" if node.type == "bool" else f"~{arguments[0]}"
+        return f"!{arguments[0]}" if source == "bool" else f"({c_type(source, real)})~{arguments[0]}"
+    if source == "f64" and op in QUIET:
+        return f"{QUIET[op]}({', '.join(arguments)})"
+    if op in ORDER:
+        return f"{arguments[0]} {ORDER[op]} {arguments[1]}"
     # Integers first, since C's operators differ from those of floating-point numbers.
-    if whole and op in WHOLE:
+    if source == "bool" and op in ("max", "min"):
         return WHOLE[op](*arguments)
+    if source not in ("f64", "bool") and op in WHOLE:
+        return _of_integers(op, source, arguments)
     if op in COMPOSED:
         return COMPOSED[op](*arguments)
     if op in INFIX:
         return f"{arguments[0]} {INFIX[op]} {arguments[1]}"
-    if op in FUNCTIONS and not whole:
+    if op in FUNCTIONS and source == "f64":
         return f"{FUNCTIONS[op]}{'f' if real == 'float' else ''}({', '.join(arguments)})"
     raise Unsupported(op)
+
+
+def _of_integers(op: str, type: Type, arguments: Sequence[str]) -> str:
+    bits = int(type[1:])
+    if type[0] == "u" and op in UNSIGNED:
+        return UNSIGNED[op](*arguments, t=f"uint{bits}_t")
+    by = f"(({arguments[-1]} >= 0 && {arguments[-1]} < {bits}) ? {arguments[-1]} : {bits - 1})"
+    if type[0] == "u":
+        by = by.replace(f"{arguments[-1]} >= 0 && ", "")
+    kind = f"uint{bits}_t" if type[0] == "u" else f"int{bits}_t"
+    return WHOLE[op](*arguments, t=kind, u=f"uint{bits}_t", s=f"int{bits}_t", b=bits, by=by)
+
+
+def _converted(source: Type, target: Type, name: str, real: Real) -> str:
+    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    if target == "bool":
+        return f"({name} != 0)"
+    kind = c_type(target, real)
+    if source != "f64" or target == "f64":
+        return f"({kind}){name}"
+    bits, least = int(target[1:]), "0"
+    end = f"{2.0 ** (bits - (target[0] == 'i')):.1f}{'f' if real == 'float' else ''}"
+    most = f"{kind[:-2].upper()}_MAX"
+    if target[0] == "i":
+        least = f"{kind[:-2].upper()}_MIN"
+    low = f"islessequal({name}, {f'-{end}' if target[0] == 'i' else '0'})"
+    return f"(isgreaterequal({name}, {end}) ? {most} : {low} ? {least} : {name} == {name} ? ({kind}){name} : 0)"
+
+
+def _as_other(source: Type, target: Type, name: str, real: Real) -> str:
+    """Read the bits of a number as another; a number of single precision is one of double precision then."""
+    if "f64" not in (source, target):
+        return f"({c_type(target, real)}){name}"
+    fields = " ".join(f"{c_type(t, 'double')} {t};" for t in (source, target))
+    return f"({c_type(target, real)})((union {{ {fields} }}){{ .{source} = {name} }}).{target}"
 
 
 WIDTH = 100  # characters of a line of a table

@@ -14,10 +14,10 @@ import numpy as np
 
 from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.graph import MOST
-from heliograph.codegen.lowering import like
+from heliograph.codegen.lowering import like, traced
 from heliograph.codegen.machine import target
 from heliograph.codegen.nodes import Unsupported
-from heliograph.codegen.program import lower
+from heliograph.codegen.program import lower_traced
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.collector import no_collector
@@ -106,7 +106,12 @@ def computed(
         choice = chosen(function, arguments, [False] * len(arguments), most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
-        return jax.tree.map(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+        return of_arrays(lambda leaf: leaf[0, ...], choice.results())  # no scalars: constants of a program
+
+
+def of_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> PyTree:
+    """Change the arrays of results; what they have beside arrays, such as a model's functions, stays."""
+    return jax.tree.map(lambda leaf: change(leaf) if isinstance(leaf, np.ndarray) else leaf, results)
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -204,8 +209,8 @@ def _made(form: Any, kinds: tuple[Any, ...], most: int) -> tuple[Compiled | None
         function, *arguments = jax.tree.unflatten(form, leaves)
         return function(*arguments)
 
+    traced_program, tree = traced(call, *(like(k.shape, k.dtype) for k in arrays))
     try:
-        program = lower(call, *(like(k.shape, k.dtype) for k in arrays), most=most)
-        return Compiled(program, [k.differs for k in arrays]), ""
+        return Compiled(lower_traced(traced_program, tree, most), [k.differs for k in arrays]), ""
     except Unsupported as error:
         return None, str(error)

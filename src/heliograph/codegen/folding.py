@@ -34,28 +34,93 @@ class Graph(Protocol):
         """Return the node of a constant."""
 
 
+def wrapped(number: int, like: Any) -> Any:
+    """Return the integer of a type that has the lowest bits of a number."""
+    kind = type(like)
+    bits = 8 * like.itemsize
+    rest = number % (1 << bits)
+    return kind(rest - (1 << bits) if rest > np.iinfo(kind).max else rest)
+
+
 def _shift_left(a: Any, b: Any) -> Any:
-    return np.left_shift(a, b) if b < 8 * a.itemsize else a * 0
+    return wrapped(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
 
 
 def _shift_right(a: Any, b: Any) -> Any:
-    return np.right_shift(a, b) if b < 8 * a.itemsize else a * 0
+    bits = 8 * a.itemsize
+    return wrapped(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
+
+
+def _shift_right_signed(a: Any, b: Any) -> Any:
+    last = 8 * a.itemsize - 1
+    signed = int(a) - (int(a) >> last << last + 1 if a > 0 else 0)  # the highest bit is the sign, of any type
+    return wrapped(signed >> (int(b) if 0 <= b <= last else last), a)
 
 
 def _divided(a: Any, b: Any) -> Any:
-    return np.divide(a, b) if isinstance(a, np.floating) else type(a)(math.trunc(int(a) / int(b)) if b else -1)
+    """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
+    if isinstance(a, np.floating):
+        return np.divide(a, b)
+    return wrapped(_quotient(int(a), int(b)) if b else -1, a)
+
+
+def _remainder(a: Any, b: Any) -> Any:
+    """Return what is left of a division, with the sign of a; of integers by 0 all."""
+    if isinstance(a, np.floating):
+        return np.fmod(a, b)
+    return wrapped(int(a) - _quotient(int(a), int(b)) * int(b) if b else int(a), a)
+
+
+def _quotient(a: int, b: int) -> int:
+    return abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
+
+
+def _maximum(a: Any, b: Any) -> Any:
+    """Return the larger number, 0 of two zeros unless both are -0; NaN if either is."""
+    return a + b if a == b == 0 and isinstance(a, np.floating) else np.maximum(a, b)
+
+
+def _minimum(a: Any, b: Any) -> Any:
+    return -_maximum(-a, -b) if isinstance(a, np.floating) else np.minimum(a, b)
+
+
+def _sign(a: Any) -> Any:
+    return a if a == 0 else np.sign(a)
+
+
+def _round_away(a: Any) -> Any:
+    whole = np.trunc(a)
+    return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
+    try:
+        return np.float64(math.pow(a, b))
+    except (ValueError, OverflowError):
+        return np.power(a, b)
+
+
+def _converted(a: Any, kind: Any) -> Any:
+    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    if not isinstance(a, np.floating) or kind in (np.float64, np.bool_):
+        return a.astype(kind)
+    ends = np.iinfo(kind)
+    return kind(0 if np.isnan(a) else ends.max if a >= ends.max else ends.min if a <= ends.min else int(a))
 
 
 # Operations whose numbers of known numbers are computed here; others wait for the run.
 EVALUATED: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divided, "rem": np.fmod, "neg": np.negative,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divided, "rem": _remainder, "neg": np.negative,
     "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "log1p": np.log1p, "expm1": np.expm1,
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": np.power,
-    "floor": np.floor, "round_even": np.rint, "ceil": np.ceil, "sign": np.sign, "is_finite": np.isfinite,
-    "max": np.maximum, "min": np.minimum,
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": _power,
+    "round_even": np.rint, "round_away": _round_away,
+    "floor": np.floor, "ceil": np.ceil, "sign": _sign, "is_finite": np.isfinite,
+    "max": _maximum, "min": _minimum,
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert,
     "shift_left": _shift_left, "shift_right": _shift_right,
+    "shift_right_signed": _shift_right_signed,
 }  # fmt: skip
 
 
@@ -74,7 +139,7 @@ def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Nod
         if op == "select":
             return args[1] if numbers[0] else args[2]
         if op == "convert":
-            value = numbers[0].astype(DTYPES[type])
+            value = _converted(numbers[0], DTYPES[type])
         elif op == "bitcast":
             value = numbers[0].view(DTYPES[type])
         elif op in EVALUATED:
@@ -110,7 +175,7 @@ def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
 def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
     if _is(b, 0):
         return a
-    if type == "f64" and _is(a, 0):
+    if type == "f64" and _is(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
         return graph.node("neg", type, b)
     if type == "f64" and b.op == "neg":
         return graph.node("add", type, a, b.args[0])
@@ -145,9 +210,7 @@ def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _neg(graph: Graph, type: Type, a: Node) -> Node | None:
-    if a.op == "neg":
-        return a.args[0]
-    return graph.node("sub", type, a.args[1], a.args[0]) if a.op == "sub" and type == "f64" else None
+    return a.args[0] if a.op == "neg" else None
 
 
 def _and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:

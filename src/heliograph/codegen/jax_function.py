@@ -23,6 +23,7 @@ OPERATIONS: dict[str, Callable[..., jax.Array]] = {
     "threefry": hashed,
     "select": lax.select, "not": lax.bitwise_not, "and": lax.bitwise_and, "or": lax.bitwise_or, "xor": lax.bitwise_xor,
     "shift_right": lax.shift_right_logical, "shift_right_signed": lax.shift_right_arithmetic,
+    "round_away": partial(lax.round, rounding_method=lax.RoundingMethod.AWAY_FROM_ZERO),
     "round_even": partial(lax.round, rounding_method=lax.RoundingMethod.TO_NEAREST_EVEN),
 }  # fmt: skip
 Memory = dict[Buffer, jax.Array]  # numbers of one run

@@ -4,8 +4,12 @@ An array of the trace is a NumPy array of nodes (or of keys of random numbers), 
 references; or, if it is long, `InMemory`. `RULES` has a rule for each operation of JAX, from the files of rules.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -41,25 +45,34 @@ class Lowering:
         values |= zip(jaxpr.invars, inputs, strict=True)
         for equation in jaxpr.eqns:
             arguments = [self._read(values, v) for v in equation.invars]
-            for variable, value in zip(equation.outvars, self.equation(equation, arguments), strict=True):
-                aval: Any = variable.aval
-                if value.shape != aval.shape:  # a wrong rule is found where it is
-                    shapes = f"{value.shape} for {aval.shape}"
-                    raise RuntimeError(f"{equation.primitive.name} at {code_line(equation)}: {shapes}")
-                values[variable] = value
+            values |= zip(equation.outvars, self.equation(equation, arguments), strict=True)
         return [self._read(values, v) for v in jaxpr.outvars]
 
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Return the results of one operation."""
+        """Return the results of one operation.
+
+        Raises:
+            Unsupported: no rule takes it, or the rule fails, which is said once for a line of code.
+        """
         name = equation.primitive.name
         try:
-            if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
-                return IN_MEMORY[name](self, equation, inputs)
-            if name not in RULES:
-                raise Unsupported(name)
-            return RULES[name](self, equation, [self.nodes(x) for x in inputs])
+            results = self._by_rule(equation, name, inputs)
+            for variable, value in zip(equation.outvars, results, strict=True):
+                aval: Any = variable.aval
+                if value.shape != aval.shape:
+                    raise ValueError(f"a result of shape {value.shape} for {aval.shape}")
+            return results
         except Unsupported as error:
             raise (error if error.where else Unsupported(error.operation, code_line(equation))) from None
+        except Exception as error:
+            raise failed(name, error, code_line(equation)) from error
+
+    def _by_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
+        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
+            return IN_MEMORY[name](self, equation, inputs)
+        if name not in RULES:
+            raise Unsupported(name)
+        return RULES[name](self, equation, [self.nodes(x) for x in inputs])
 
     def nodes(self, value: Value) -> np.ndarray:
         """Return a value as a NumPy array of nodes."""
@@ -87,6 +100,30 @@ class Lowering:
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
         return self.known(v.val) if isinstance(v, Literal) else values[v]
+
+
+def failed(operation: str, error: Exception, where: str) -> Unsupported:
+    """Return an error by which XLA computes a program whose native code cannot be made, and say so once for a line."""
+    refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
+    _say(f"native code: {refused}; XLA computes")
+    return refused
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Turn a failure of what makes native code into a refusal, by which XLA computes."""
+    try:
+        yield
+    except Unsupported:
+        raise
+    except Exception as error:
+        raise failed(what, error, "") from error
+
+
+@cache
+def _say(text: str) -> None:
+    """Warn once in a process."""
+    warnings.warn(text, RuntimeWarning, stacklevel=2)
 
 
 def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
@@ -141,7 +178,7 @@ def known_integers(value: np.ndarray) -> np.ndarray | None:
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
-    return np.array([int(x.value) for x in flat], dtype=np.int64).reshape(value.shape)
+    return np.array([min(int(x.value), sys.maxsize) for x in flat], dtype=np.int64).reshape(value.shape)
 
 
 def code_line(equation: JaxprEqn) -> str:
@@ -153,11 +190,30 @@ def code_line(equation: JaxprEqn) -> str:
     return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""
 
 
+class _Held(NamedTuple):
+    """A part of a result that is no array, such as a function: what is restored in its place is it itself."""
+
+    value: Any
+
+
+jax.tree_util.register_pytree_node(_Held, lambda held: ((), held.value), lambda value, _: value)
+ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
+
+
 def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJaxpr, Any]:
-    """Trace a function of one run in double precision; return its program and the structure of its result."""
+    """Trace a function of one run in double precision; return its program and the structure of its result.
+
+    What a result has beside arrays, as a filter its model's functions, is part of the structure.
+    """
+    structure: list[Any] = []
+
+    def call(*leaves: Any) -> list[Any]:
+        returned = function(*jax.tree.unflatten(tree, leaves))
+        arrays, form = jax.tree.flatten(jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _Held(x), returned))
+        structure[:] = [form]
+        return arrays
+
     with jax.enable_x64(True):
         flat, tree = jax.tree.flatten(examples)
-        program, shape = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True)(
-            *flat
-        )
-    return program, jax.tree.structure(shape)
+        program = jax.make_jaxpr(call)(*flat)
+    return program, structure[0]

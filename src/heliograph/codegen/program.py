@@ -26,7 +26,9 @@ from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     matrices,
     random_bits,
     rows,
+    scatter,
     shapes,
+    sorting,
     special,
     views,
 )

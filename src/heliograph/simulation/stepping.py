@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.codegen.engine import chosen, compiled, computed
+from heliograph.codegen.engine import chosen, compiled, computed, of_arrays
 from heliograph.filters.base import AbstractFilter, sized
 from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
@@ -270,7 +270,7 @@ def _planned(alike: Alike, u: Array) -> Alike:
         choice = chosen(_planned_filter, arguments, (True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
-    planned = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
+    planned = of_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 
 

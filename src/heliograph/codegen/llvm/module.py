@@ -14,7 +14,7 @@ from heliograph.codegen.llvm.lanes import WIDTH, gather, lane_numbers, types
 from heliograph.codegen.llvm.operations import BITS
 from heliograph.codegen.llvm.text import Slots, Writer, loops_of, turns_of
 from heliograph.codegen.llvm.transposed import mover
-from heliograph.codegen.lowering import Lowering
+from heliograph.codegen.lowering import Lowering, refusing
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.nodes import Buffer, Node, Type, Unsupported
 from heliograph.codegen.program import (
@@ -118,6 +118,7 @@ def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
     return InMemory.whole(buffer)
 
 
+@refusing("the text of a program")
 def written(
     program: Program,
     differing: Iterable[bool],

@@ -16,7 +16,14 @@ BITS = {"f64": 64, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in 
 FLOAT = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
 ORDER = {"eq": "eq", "ne": "ne", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge"}
-UNARY = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil", "round_even": "roundeven"}
+UNARY = {
+    "sqrt": "sqrt",
+    "abs": "fabs",
+    "floor": "floor",
+    "ceil": "ceil",
+    "round_even": "roundeven",
+    "round_away": "round",
+}
 CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` before the name
 
 Emit = Callable[[str], str]  # the text of an operation -> the name of its result
@@ -107,14 +114,46 @@ def _of_integers(node: Node, names: list[str], text: str, emit: Emit) -> str:
         return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}({first}, {text} {names[1]})")
     if op == "abs" and signed:
         return emit(f"call {text} @llvm.abs({first}, i1 false)")
-    # Division by zero and shifts by all bits are undefined in LLVM: only constants are accepted.
-    if op in ("div", "rem") and node.args[1].op == "constant" and node.args[1].value > 0:
-        return emit(f"{'s' if signed else 'u'}{op} {first}, {names[1]}")
-    if op in ("shift_left", "shift_right", "shift_right_signed") and node.args[1].op == "constant":
-        if not 0 <= node.args[1].value < BITS[type]:
-            raise Unsupported("a shift by more than all bits")
-        return emit(f"{ {'shift_left': 'shl', 'shift_right': 'lshr'}.get(op, 'ashr') } {first}, {names[1]}")
+    if op == "sign":
+        limited = emit(f"call {text} @llvm.{'s' if signed else 'u'}min({first}, {text} {splat(1, type)})")
+        return emit(f"call {text} @llvm.smax({text} {limited}, {text} {splat(-1, type)})") if signed else limited
+    if op in ("div", "rem"):
+        return _divided(node, names, text, emit)
+    if op in ("shift_left", "shift_right", "shift_right_signed"):
+        return _shifted(node, names, text, emit)
     raise Unsupported(f"{op} of {type}")
+
+
+def _divided(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Emit a division of integers, or its rest: by 0 all bits set, or a; the least number by -1 is itself, or 0."""
+    op, type, (a, b) = node.op, node.args[0].type, names
+    how = f"{'s' if type[0] == 'i' else 'u'}{op}"
+    if node.args[1].op == "constant" and node.args[1].value not in (0, -1):
+        return emit(f"{how} {text} {a}, {b}")
+    # What LLVM does not define is divided by 1, which has the right result of the least number by -1.
+    truth = vector("bool")
+    zero = unsafe = emit(f"icmp eq {text} {b}, zeroinitializer")
+    if type[0] == "i":
+        unsafe = emit(f"or {truth} {zero}, {emit(f'icmp eq {text} {b}, {splat(-1, type)}')}")
+        least = emit(f"icmp eq {text} {a}, {splat(-(2 ** (BITS[type] - 1)), type)}")
+        unsafe = emit(f"and {truth} {unsafe}, {emit(f'or {truth} {zero}, {least}')}")
+    safe = emit(f"select {truth} {unsafe}, {text} {splat(1, type)}, {text} {b}")
+    divided = emit(f"{how} {text} {a}, {safe}")
+    return emit(f"select {truth} {zero}, {text} {splat(-1, type) if op == 'div' else a}, {text} {divided}")
+
+
+def _shifted(node: Node, names: list[str], text: str, emit: Emit) -> str:
+    """Emit a shift; by all bits or more, 0 is left, or the sign."""
+    op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
+    how = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
+    if by.op == "constant" and 0 <= by.value < BITS[type]:
+        return emit(f"{how} {text} {a}, {b}")
+    within = emit(f"call {text} @llvm.umin({text} {b}, {text} {splat(BITS[type] - 1, type)})")
+    shifted = emit(f"{how} {text} {a}, {within}")
+    if how == "ashr":
+        return shifted
+    inside = emit(f"icmp ult {text} {b}, {splat(BITS[type], type)}")
+    return emit(f"select {vector('bool')} {inside}, {text} {shifted}, {text} zeroinitializer")
 
 
 def _converted(source: Type, target: Type, name: str, emit: Emit) -> str:

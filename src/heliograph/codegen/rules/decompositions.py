@@ -149,8 +149,8 @@ def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             here = taken == i
             rows[j], rows[i] = jnp.where(here, rows[i], rows[j]), jnp.where(here, rows[j], rows[i])
             order[j], order[i] = jnp.where(here, order[i], order[j]), jnp.where(here, order[j], order[i])
-        # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j.
-        scale = 1 / rows[j][j]
+        # Elimination: l_ij = a_ij / a_jj, a_i <- a_i - l_ij a_j; below a pivot of zero the column is zeros, and stays.
+        scale = 1 / jnp.where(rows[j][j] == 0, 1.0, rows[j][j])
         for i in range(j + 1, n):
             factor = rows[i][j] * scale
             rest = rows[i][j + 1 :] - factor * rows[j][j + 1 :]

@@ -17,7 +17,7 @@ ELEMENTWISE = {name: name for name in (
     "add", "sub", "mul", "div", "rem", "neg", "abs", "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan",
     "tanh", "atan2", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
     "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "asin", "acos", "atan",
-    "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "nextafter",
+    "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2",
 )} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
 
 
@@ -145,9 +145,7 @@ def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: N
 
 
 def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    if int(params["rounding_method"]) != 1:
-        raise Unsupported("rounding of halves away from zero")
-    return graph.node("round_even", type, x)
+    return graph.node("round_even" if int(params["rounding_method"]) else "round_away", type, x)
 
 
 def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
@@ -170,8 +168,24 @@ def _total_order(op: str) -> Callable[..., Node]:
     return lambda graph, type, params, x, y: graph.node(op, type, rank(graph, x), rank(graph, y))
 
 
+def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
+    """Return the number next to x towards y: its bits, as an integer, and one more or less; y of equal ones."""
+    node, zero, one = graph.node, graph.constant(0.0, type), graph.constant(1, "i64")
+    bits = node("bitcast", "i64", x)
+    # Away from zero one more: where x < y and x is positive, or x > y and it is negative.
+    away = node("eq", "bool", node("lt", "bool", x, y), node("lt", "bool", zero, x))
+    beside = node("select", "i64", away, node("add", "i64", bits, one), node("sub", "i64", bits, one))
+    tiny = node(
+        "select", type, node("lt", "bool", y, zero), graph.constant(-5e-324, type), graph.constant(5e-324, type)
+    )
+    moved = node("select", type, node("eq", "bool", x, zero), tiny, node("bitcast", type, beside))
+    moved = node("select", type, node("eq", "bool", x, y), y, moved)
+    known = node("and", "bool", node("eq", "bool", x, x), node("eq", "bool", y, y))
+    return node("select", type, known, moved, graph.constant(math.nan, type))
+
+
 def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
-    return graph.node("shift_right" if type[0] == "u" else "shift_right_signed", type, x, by)
+    return graph.node("shift_right_signed", type, x, by)
 
 
 RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
@@ -183,7 +197,7 @@ RULES |= {
     "one_minus_square": _composed(_one_minus_square), "log2": _composed(_log2), "polynomial": _composed(_polynomial),
     "eq_to": _composed(_total_order("eq")), "le_to": _composed(_total_order("le")),
     "lt_to": _composed(_total_order("lt")), "round": _composed(_round),
-    "shift_right_arithmetic": _composed(_shift_right_arithmetic),
+    "nextafter": _composed(_next_after), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
 }  # fmt: skip
 PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 RULES |= dict.fromkeys(PASSED_ON, _as_it_is)

@@ -44,6 +44,8 @@ def _within(type: Type, number: float) -> float:
 def _cumulative(op: str) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axis, type = equation.params["axis"], result_type(equation)
+        if not inputs[0].size:
+            return inputs
         x = np.moveaxis(inputs[0], axis, 0)
         x = (x[::-1] if equation.params["reverse"] else x).reshape(len(x), -1)
         rows = [x[0].tolist()]
@@ -87,12 +89,13 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
     x, y = (_of_type(graph, type, x) for x in inputs)
     a, b = _batched(x, left, left_batch), _batched(y, right, right_batch)
     inner = a.shape[2]
+    product, sum_ = ("and", "or") if type == "bool" else ("mul", "add")
     nodes = []
     for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
         for row in rows:
             for column in columns:
-                products = [graph.node("mul", type, row[k], column[k]) for k in range(inner)]
-                nodes.append(total(graph, "add", type, products, 0.0 if type == "f64" else 0))
+                products = [graph.node(product, type, row[k], column[k]) for k in range(inner)]
+                nodes.append(total(graph, sum_, type, products, 0.0 if type == "f64" else 0))
     return [array_of(nodes, result_shape(equation))]
 
 
@@ -120,9 +123,10 @@ def _each_matrix(function: Any) -> Rule:
 
 
 def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
-    """Compute A = L L' column by column, one reciprocal each; NaN if the matrix is not positive definite."""
+    """Compute A = L L' column by column, one reciprocal each; all NaN if the matrix is not positive definite."""
     n = len(a)
-    zero = graph.constant(0.0, "f64")
+    zero, missing = graph.constant(0.0, "f64"), graph.constant(float("nan"), "f64")
+    definite = graph.constant(True, "bool")
     lower = np.full((n, n), zero, dtype=object)
     for j in range(n):
         # a_ij - sum_k l_ik l_jk for the rows i >= j.
@@ -134,13 +138,14 @@ def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
             rests.append(rest)
         # l_jj = sqrt(rest), l_ij = rest / l_jj.
         root = graph.node("sqrt", "f64", rests[0])
-        positive = graph.node("gt", "bool", rests[0], zero)
-        root = graph.node("select", "f64", positive, root, graph.constant(float("nan"), "f64"))
+        negative = graph.node("le", "bool", rests[0], zero)  # NaN is not, and stays where it leads to
+        definite = graph.node("and", "bool", definite, graph.node("not", "bool", negative))
         scale = graph.node("div", "f64", graph.constant(1.0, "f64"), root)
         lower[j, j] = root
         for i in range(j + 1, n):
             lower[i, j] = graph.node("mul", "f64", rests[i - j], scale)
-    return lower
+    numbers = [graph.node("select", "f64", definite, x, missing) for x in lower.ravel().tolist()]
+    return array_of(numbers, lower.shape)
 
 
 def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:

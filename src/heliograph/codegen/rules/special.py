@@ -1,6 +1,7 @@
 """Rules of special functions by their series: incomplete gamma functions, Bessel functions, the digamma function."""
 
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cache, partial
 from typing import Any
 
@@ -16,7 +17,9 @@ EPSILON = float(np.finfo(np.float64).eps)
 FAR = 30.0  # the argument of a Bessel function from which its asymptotic series has all digits
 BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160]  # B_2n / (2 n)
 TINY = float(np.finfo(np.float64).tiny) / EPSILON
-Fraction = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
+LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to a^-3, and the terms of a coefficient
+TURNS = 5000  # of a series or a fraction, several times as many as it takes
+Quotients = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # turn, Lentz's C and D, value, last change
 
 
 def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -28,6 +31,10 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31; Lentz, Generating Bessel
     functions in Mie scattering calculations using continued fractions (1976).
     """
+    valid = (a > 0) & (x >= 0)
+    large, whole = a > LARGE, x
+    by_expansion = large_masses(a, x)
+    a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
     above = x > a + 1
     density = jnp.exp(a * jnp.log(x) - x - jax.lax.lgamma(a))
 
@@ -38,10 +45,12 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         return shape + 1, term, total + term
 
     first = jnp.where(above, 0.0, 1 / a)
-    lower = density * jax.lax.while_loop(lambda s: s[1] > EPSILON * s[2], add, (a, first, first))[2]
+    lower = (
+        density * jax.lax.while_loop(lambda s: (s[1] > EPSILON * s[2]) & (s[0] < a + TURNS), add, (a, first, first))[2]
+    )
 
     # Above it the continued fraction by Lentz's two quotients C and D.
-    def continue_fraction(state: Fraction) -> Fraction:
+    def continue_fraction(state: Quotients) -> Quotients:
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _apart(b + numerator * d)
@@ -49,12 +58,65 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     start = 1 / jnp.where(above, x + 1 - a, 1.0)
     state = (jnp.ones_like(x), jnp.full_like(x, 1 / TINY), start, start, jnp.where(above, 1.0, 0.0))
-    upper = density * jax.lax.while_loop(lambda s: s[4] > EPSILON, continue_fraction, state)[3]
+    upper = density * jax.lax.while_loop(lambda s: (s[4] > EPSILON) & (s[0] < TURNS), continue_fraction, state)[3]
 
     # Both masses, the smaller one to all its digits.
-    p = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
-    valid = (a > 0) & (x >= 0)
-    return jnp.where(valid, p, jnp.nan), jnp.where(valid, jnp.where(above & (x < jnp.inf), upper, 1 - p), jnp.nan)
+    below = jnp.where(x == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
+    beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
+    p, q = (jnp.where(large & (whole < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
+    p, q = jnp.where(whole == jnp.inf, 1.0, p), jnp.where(whole == jnp.inf, 0.0, q)
+    return jnp.where(valid, p, jnp.nan), jnp.where(valid, q, jnp.nan)
+
+
+def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute P(a, x) and Q(a, x) of a large shape a, in which the series above would take many terms.
+
+    With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
+    Q = erfc(y root(a / 2)) / 2 + e^(-a y^2 / 2) / root(2 pi a) (c_0(y) + c_1(y) / a + c_2(y) / a^2), P = 1 - Q.
+
+    Source: Temme, The asymptotic expansion of the incomplete gamma functions (1979); DLMF 8.12.3, 8.12.4.
+    """
+    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond, the smaller mass is below all numbers
+    # m - log(1 + m) = m s - 2 (s^3 / 3 + s^5 / 5 + ...), s = m / (2 + m).
+    s = m / (2 + m)
+    tail = jnp.zeros_like(m)
+    for n in range(27, 1, -2):
+        tail = (tail + 1 / n) * s * s
+    half = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))
+    y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half)
+    # The three coefficients as power series of y.
+    rest = jnp.zeros_like(y)
+    for series in expansion()[::-1]:
+        value = jnp.zeros_like(y)
+        for c in series[::-1]:
+            value = value * y + c
+        rest = rest / a + value
+    rest = rest * jnp.exp(-a * half) / jnp.sqrt(2 * np.pi * a)
+    z = y * jnp.sqrt(a / 2)
+    return jax.lax.erfc(-z) / 2 - rest, jax.lax.erfc(z) / 2 + rest
+
+
+@cache
+def expansion() -> list[list[float]]:
+    """Compute the power series in y of c_0, c_1 and c_2, of `TERMS` terms.
+
+    c_0 = 1 / m - 1 / y, c_k = c_(k-1)' / y + (-1)^k g_k / m with g_1 = 1 / 12, g_2 = 1 / 288, and y (1 + m) = m m'.
+    """
+    count = TERMS + 5
+    # m = y (1 + b_1 y + b_2 y^2 + ...), and 1 / m = (1 + r_1 y + ...) / y.
+    b = [Fraction(1)]
+    for n in range(1, count):
+        known = sum((b[k] * b[n - k] * (n - k + 1) for k in range(1, n)), Fraction(0))
+        b.append((b[n - 1] - known) / (n + 2))
+    r = [Fraction(1)]
+    for n in range(1, count):
+        r.append(-sum((b[k] * r[n - k] for k in range(1, n + 1)), Fraction(0)))
+    # The poles at y = 0 cancel.
+    series = [r[1:]]
+    for sign_g in (Fraction(-1, 12), Fraction(1, 288)):
+        before = series[-1]
+        series.append([(n + 2) * before[n + 2] + sign_g * r[n + 1] for n in range(len(before) - 2)])
+    return [[float(c) for c in one[:TERMS]] for one in series]
 
 
 def _apart(x: jax.Array) -> jax.Array:
@@ -83,7 +145,7 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     total = jax.lax.while_loop(lambda s: jnp.abs(s[1]) > EPSILON / 8 * s[2], add, (jnp.ones_like(x), first, first))[2]
     scale = jnp.where(large, 1 / jnp.sqrt(2 * np.pi * jnp.where(large, size, 1.0)), jnp.exp(-size))
     value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
-    return jnp.where(x < 0, -value, value) if order else value
+    return jnp.where(x < 0, -value, jnp.where(x == 0, x, value)) if order else value
 
 
 def digamma(x: jax.Array) -> jax.Array:
@@ -105,8 +167,7 @@ def digamma(x: jax.Array) -> jax.Array:
     value = jnp.log(at) - 0.5 / at - tail - passed
     nearest = x - jnp.round(x)
     turned = np.pi / jnp.tan(np.pi * jnp.where(nearest == 0, 1.0, nearest))
-    pole = jnp.where(x == 0, -1 / x, jnp.where(nearest == 0, jnp.nan, value - turned))
-    return jnp.where(mirrored, pole, value)
+    return jnp.where(mirrored, jnp.where(nearest == 0, jnp.nan, value - turned), value)
 
 
 def _masses(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, array_of, result_shape
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.nodes import Buffer, Key, Node
-from heliograph.codegen.rules.elementwise import PASSED_ON
+from heliograph.codegen.rules.elementwise import PASSED_ON, select
 from heliograph.codegen.rules.loops import copied, in_memory, repeated
+from heliograph.codegen.rules.places import clamped, fill_of, fills, inside, narrowed
 from heliograph.codegen.rules.shapes import FEW, chosen
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
@@ -109,34 +110,31 @@ def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     return in_memory(lowering, x)
 
 
-def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
-    """Clamp a place between 0 and the last one."""
-    if start.op == "constant" or last == 0:
-        return min(max(int(start.value or 0), 0), last)
-    graph = lowering.graph
-    wide = graph.node("convert", "i64", start)
-    return graph.node(
-        "min", "i64", graph.node("max", "i64", wide, graph.constant(0, "i64")), graph.constant(last, "i64")
-    )
-
-
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Gather x[i, j, ...] of whole rows as a view; other gathers use nodes."""
+    """Gather x[i, j, ...] of whole rows as a view, where no other value fills what is outside; others use nodes."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
+    indices = narrowed(lowering, indices) if fills(equation) else indices
     x = indexable(lowering, inputs[0], [indices])
     if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
-    offset, moves = 0, []
+    offset, moves, flag = 0, [], lowering.graph.constant(True, "bool")
     for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
-        first = clamped(lowering, start, x.shape[axis] - sizes[axis])
+        last = x.shape[axis] - sizes[axis]
+        first = clamped(lowering, start, last)
+        flag = lowering.graph.node("and", "bool", flag, inside(lowering.graph, start, last))
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
             moves.append((x.strides[axis], first))
     left = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
     view = x.view([sizes[a] for a in left], [x.strides[a] for a in left], offset, *moves)
-    return [view.view(result_shape(equation), _matched(view, result_shape(equation)))]
+    row = view.view(result_shape(equation), _matched(view, result_shape(equation)))
+    if not fills(equation) or (flag.op == "constant" and flag.value):
+        return [row]
+    # A row that is not inside is filled with a value.
+    missing, nodes = fill_of(lowering, equation), lowering.nodes(row)
+    return [array_of([select(lowering.graph, flag, n, missing) for n in nodes.ravel().tolist()], nodes.shape)]
 
 
 def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:

@@ -1,0 +1,67 @@
+# ruff: noqa: E501, E731
+"""Cases of decompositions and special functions: singular, indefinite and zero matrices, NaN among the entries."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from tests.codegen.conformance.case import Case, of_each_type
+
+RANDOM = np.random.default_rng(3)
+SQUARE = RANDOM.normal(size=(3, 3))
+DEFINITE = SQUARE @ SQUARE.T + np.eye(3)
+MISSING = DEFINITE.copy()
+MISSING[1, 1] = np.nan
+MATRICES = np.stack([
+    DEFINITE, -DEFINITE, np.zeros((3, 3)), np.eye(3), np.ones((3, 3)), np.diag([1.0, 0.0, 2.0]), np.diag([1.0, -1.0, 2.0]),
+    np.diag([1.0, 2.0, -1e-20]), np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[1.0, 2, 0], [2, 4, 0], [0, 0, 1]]),
+    1e200 * DEFINITE, 1e-200 * DEFINITE, MISSING,
+])  # fmt: skip
+KNOWN = MATRICES[:-1]  # LAPACK passes over NaN when it seeks a pivot
+GENERAL = np.concatenate([KNOWN, RANDOM.normal(size=(3, 3, 3)), np.array([[[0.0, 2, 1], [0, 1, 1], [0, 3, 2]]])])
+VECTORS = RANDOM.normal(size=(len(GENERAL), 3))
+ROUNDED = 1000.0  # units: of matrices whose condition is some hundred
+
+
+def _of_one(matrices: np.ndarray) -> np.ndarray:
+    return matrices[:, :1, :1]
+
+
+def _triangular() -> list[Case]:
+    cases = []
+    for lower in (True, False):
+        for transposed in (0, 1):
+            for unit in (False, True):
+
+                def solve(
+                    a: jax.Array, b: jax.Array, how: tuple[bool, int, bool] = (lower, transposed, unit)
+                ) -> jax.Array:
+                    return jax.scipy.linalg.solve_triangular(a, b, lower=how[0], trans=how[1], unit_diagonal=how[2])
+
+                cases.append(Case(solve, (GENERAL, VECTORS), ROUNDED, f"{lower} {transposed} {unit}"))
+    right = lambda a, b: lax.linalg.triangular_solve(a, jnp.stack([b, 2 * b]), left_side=False, lower=True)
+    return [*cases, Case(right, (GENERAL, VECTORS), ROUNDED, "right")]
+
+
+def _masses() -> tuple[np.ndarray, np.ndarray]:
+    shapes = [0.0, -1.0, 0.5, 1.0, 3.0, 30.0, 1e3, 9e3, 2e4, 1e6, 2.0**31, 1e17, np.inf, np.nan]
+    factors = [0.0, -1.0, 0.3, 0.99, 1.0, 1.01, 3.0, np.inf, np.nan]
+    pairs = np.array([(a, a * f if np.isfinite(f) and f > 0 else f) for a in shapes for f in factors])
+    return pairs[:, 0], pairs[:, 1]
+
+
+CASES: dict[str, list[Case]] = {
+    "cholesky": [Case(jnp.linalg.cholesky, (m,), ROUNDED) for m in (MATRICES, _of_one(MATRICES))],
+    "triangular_solve": _triangular(),
+    "lu": [
+        Case(lambda a: lax.linalg.lu(a), (GENERAL,), ROUNDED), Case(lambda a: lax.linalg.lu(a), (_of_one(GENERAL),)),
+        Case(lambda a: jnp.linalg.det(a), (GENERAL[:-1],), ROUNDED),
+    ],
+    "custom_linear_solve": [Case(jnp.linalg.solve, (GENERAL, VECTORS), ROUNDED), Case(jnp.linalg.inv, (GENERAL,), ROUNDED)],
+    "eigh": [Case(jnp.linalg.eigvalsh, (KNOWN[:7],), ROUNDED), Case(jnp.linalg.eigvalsh, (_of_one(MATRICES),), ROUNDED)],
+    "igamma": [Case(jax.scipy.special.gammainc, _masses(), 1e6)], "igammac": [Case(jax.scipy.special.gammaincc, _masses(), 1e6)],
+    "digamma": of_each_type(jax.scipy.special.digamma, 1, 1e4, dtypes=(np.float64,)),
+    "bessel_i0e": of_each_type(jax.scipy.special.i0e, 1, 20.0, dtypes=(np.float64,)),
+    "bessel_i1e": of_each_type(jax.scipy.special.i1e, 1, 20.0, dtypes=(np.float64,)),
+}  # fmt: skip
