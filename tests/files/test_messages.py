@@ -247,3 +247,43 @@ def test_a_type_that_the_bag_does_not_define_is_one_line(world, tmp_path):
         database.execute("DELETE FROM message_definitions")
     with pytest.raises(ValueError, match=r"/tank: expected a message type that the bag defines, got 'tank/msg/Level'"):
         hg.files.read_messages(tmp_path / "old", network, {"/tank": hg.files.json_field("level", "gps")})
+
+
+def test_a_folder_of_bags_is_read_as_one(world, tmp_path):
+    """Parts that a recorder wrote, without the metadata of ROS 2 beside them."""
+    network, sources, drive, whole = world
+    messages, folder = drive.messages(), tmp_path / "parts"
+    folder.mkdir()
+    for i, part in enumerate((messages[:100], messages[100:])):
+        bags.write(tmp_path / f"b{i}", part).rename(folder / f"part_{i}.mcap")
+    table, expected = (hg.files.read_messages(path, network, sources) for path in (folder, whole))
+    for name, columns in table.columns.items():
+        assert columns.time == expected.columns[name].time and columns.values == expected.columns[name].values
+
+
+def test_a_stamp_with_an_offset_is_the_same_one_by_one(world, monkeypatch):
+    from heliograph.files.bag_layout import Decoder
+
+    network, _, drive, path = world
+    field = hg.files.json_field("pose.pose.position.x", "gps", time=hg.files.Stamp("header.stamp", -0.05))
+    yaw = hg.files.json_field(hg.files.Yaw("pose.pose.orientation"), "inputs", time="header.stamp")
+    table = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
+    monkeypatch.setattr(Decoder, "add", lambda decoder, batch, table: False)
+    one = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
+    order = np.argsort(drive.logged, kind="stable")
+    assert list(table.columns["gps"].time) == (drive.measured[order] - 5 * 10**7).tolist()
+    assert all(table.columns[n].time == one.columns[n].time for n in ("gps", "inputs"))
+    assert set(table.columns["inputs"].values) == set(one.columns["inputs"].values) == {0.0}
+
+
+def test_parquet_of_another_hand_is_mapped_too(world, tmp_path):
+    """Dates with a zone and without digits lost; rows that lack a number did not arrive."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    network, *_ = world
+    at = pa.array([bags.START, bags.START + 1, bags.START + 10**9], pa.timestamp("ns", "Europe/Berlin"))
+    values = pa.array([1.0, None, 2.0], pa.float32())
+    pq.write_table(pa.table({"at": at, "mm": values, "note": ["a", "b", None]}), tmp_path / "log.parquet")
+    field = hg.files.json_field("mm", "gps", scale=1e-3, time="at")
+    rows = hg.files.read_messages(tmp_path / "log.parquet", network, {"log.parquet": field}).recording()
+    np.testing.assert_array_equal(rows.time, [0.0, 1e-9, 1.0])
+    np.testing.assert_array_equal(rows.measurements["gps"][:, 0], [1e-3, np.nan, 2e-3])

@@ -69,6 +69,8 @@ def test_honest_values_beyond_limits_cost_the_claim_what_is_said(c):
     ("value", "code", "same"),
     [
         (float(np.float32(-9999.9)), -9999.9, True),  # as a column of single precision has it
+        (float(np.float32(-9999.9)) * 0.1, -999.99, True),  # and scaled
+        (float(np.float32(2147483647)), 2147483647, True),
         (32767 * 0.1, 3276.7, True),  # a whole number that was scaled
         (32767 * 0.01, 327.67, True),
         (2147483646.0, 2147483647.0, False),

@@ -11,6 +11,8 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 
 ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor in it, relative
 
+SINGLE = float(np.finfo(np.float32).eps) / 2  # of a number in single precision, relative
+
 LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
 
 
@@ -69,10 +71,11 @@ def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray
     numbers = np.asarray(z, dtype=np.float64)[..., None]
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
-    rounding = ROUNDING * np.abs(codes)
+    # Whole numbers are exact in both precisions, but for the largest.
     with np.errstate(over="ignore"):
         single = codes.astype(np.float32).astype(np.float64)
-    near = (np.abs(numbers - codes) <= rounding) | (np.abs(numbers - single) <= rounding)
+    rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)
+    near = (np.abs(numbers - codes) <= rounding) | (numbers == single)
     return np.asarray(near.any(axis=-1))
 
 
