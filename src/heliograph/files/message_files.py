@@ -38,7 +38,7 @@ class FileMessage(NamedTuple):
 
 def is_message_file(path: Path) -> bool:
     """Return whether a file has lines of messages, by its name."""
-    return kind_of(path) in LINES and path.is_file()
+    return kind_of(path) in LINES
 
 
 def message_name(path: Path) -> str:

@@ -158,7 +158,7 @@ def _received(row: Mapping[str, Any], names: Sequence[str], where: str, numbered
     """Return the values of one event; where it is `numbered` the last, of what was lost, may be left to its count."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
-        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
+        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _items(cell)
         if numbered and len(parts) == len(names) - 1:
             parts.append("nan" if isinstance(cell, str) else np.nan)
         if len(parts) != len(names):
@@ -166,6 +166,10 @@ def _received(row: Mapping[str, Any], names: Sequence[str], where: str, numbered
         from_text = isinstance(cell, str)
         return np.array([_number(word, f"{where}, column {VALUES!r}", True, from_text) for word in parts])
     return np.array([_number(row.get(name), f"{where}, column {name!r}", True) for name in names])
+
+
+def _items(cell: Any) -> list[Any]:
+    return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 
 def _whole(cell: Any, name: str) -> int:
