@@ -71,8 +71,9 @@ def _command(arguments: Sequence[str] | None) -> int:
     # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
-        with uninterrupted():  # modules in C that import it print what interrupts them
-            import numpy  # noqa: F401
+        if command in COMMANDS and bound.arguments:  # help and lists compute nothing
+            with uninterrupted():  # modules in C that import it print what interrupts them
+                import numpy  # noqa: F401
         with _plain_warnings():
             code: int | None = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
