@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 import heliograph as hg
-from heliograph.numerics.check import unmasked
+from heliograph.numerics.masked import unmasked
 
 PLANT = hg.LinearPlant([[1.0]], 1469.0, [1000.0], [[1e6]], states=["level"])
 SENSOR = hg.LinearSensor([[1.0]], 15099.0, outputs=["flow"])

@@ -14,8 +14,9 @@ import numpy as np
 
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import FORMATS, check_output, format_of, whole_file
-from heliograph.numerics.check import InputError, fail, file_path, is_absent, shown, table, unmasked
+from heliograph.numerics.check import InputError, fail, file_path, shown, table
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
+from heliograph.numerics.masked import is_absent, unmasked
 from heliograph.numerics.types import Shaped
 
 TIME = "time"

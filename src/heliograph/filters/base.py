@@ -20,8 +20,9 @@ from heliograph.model.inputs import check_time_step, inputs_spoil
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premise import NOTHING, Kept, Premise, believes
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.check import fail, shown, unmasked
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.masked import unmasked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.traced import is_traced

@@ -12,8 +12,9 @@ import numpy as np
 from heliograph.codegen.engine import computed
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail, unmasked
+from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.masked import unmasked
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 

@@ -4,7 +4,8 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from heliograph.numerics.check import fail, is_whole, shown, unmasked
+from heliograph.numerics.check import fail, is_whole, shown
+from heliograph.numerics.masked import unmasked
 from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]

@@ -7,7 +7,8 @@ import numpy as np
 
 from heliograph.filters.rows import rows
 from heliograph.model.inputs import check_inputs
-from heliograph.numerics.check import array, fail, shown, unmasked
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.masked import unmasked
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
