@@ -26,3 +26,11 @@ class Losing(h.filters.AbstractFilter):
 
     def estimate(self, state):
         return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
+
+
+class Tied(Losing):
+    """A filter whose covariance has a correlation of 2 from its third step, though no variance is negative."""
+
+    def estimate(self, state):
+        tied = jnp.eye(2) + (1 - state[1]) * jnp.array([[0.0, 1.0], [1.0, 0.0]])
+        return h.model.Estimate(0 * state, tied, self.claim)

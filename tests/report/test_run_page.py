@@ -15,7 +15,7 @@ from heliograph.report.health import FilterHealth, examine
 from heliograph.report.outputs import errors_of, rounded
 from heliograph.report.run_page import errors_table, run_figures, run_page, run_summary
 from heliograph.simulation.results.whiteness import MemoryTest
-from tests.losing import Losing
+from tests.losing import Tied
 
 STEPS = 300
 DRIFT = 0.95 * np.eye(1)
@@ -87,7 +87,7 @@ def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
     """Neither in the table of tests nor beside its errors, nor in the summary."""
     plant = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
     sensor = hg.LinearSensor([[1.0, 0.0]], 0.1)
-    filters = {"losing": Losing(), "kalman": hg.kalman_filter(plant, sensor)}
+    filters = {"losing": Tied(), "kalman": hg.kalman_filter(plant, sensor)}
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), filters)})
     z = np.random.default_rng(0).normal(size=(30, 1))
     record = hg.run(network, {"a": z}, truth=np.zeros((30, 2)))
