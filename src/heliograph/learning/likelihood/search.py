@@ -14,6 +14,7 @@ HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its numb
 SAME = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
 SPREAD = 3.0  # of starts, in each coordinate that is a logarithm or a logit
 AWAY = 10.0  # standard errors of starts from a maximum, in each real number
+LOWERED = 10.0  # steps of a logarithm to a start near the end of its domain
 FURTHER = 5.0  # from where a number is hardly seen to where it counts as at the end
 ROUNDS = 6  # of climbs, ends of domains, and proofs
 INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
@@ -71,7 +72,7 @@ class Search:
     ends: Float[np.ndarray, " starts"] = field(default_factory=lambda: np.zeros(0))
 
     def run(self, starts: Float[np.ndarray, "starts p"], seed: int) -> Top:
-        """Climb from all starts, then from as many others around the best, less one; prove the highest end.
+        """Climb from all starts, then from as many others around the best, and one near each end; prove the highest.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.
@@ -105,16 +106,22 @@ class Search:
             top = _top(self._climb(again, none), none)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
-    def _around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "count p"]:
-        """Points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away."""
+    def _around(self, top: Top, count: int, seed: int) -> Float[np.ndarray, "points p"]:
+        """Points around a maximum: logarithms and logits within SPREAD, real numbers some standard errors away.
+
+        Besides one for each number that has an end of its domain, which is near it there.
+        """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
-        drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count, len(top.x)))
+        lowered = np.flatnonzero(self.surface.domains.single)
+        drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(lowered), len(top.x)))
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             rise = self._inwards(top, int(index))[1]
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
-        return self.surface.possible(centre + drawn * spread, top.x)
+        points = centre + drawn * spread
+        points[count + np.arange(len(lowered)), lowered] -= LOWERED
+        return self.surface.possible(points, top.x)
 
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
         def seen(now: Maximum) -> None:
