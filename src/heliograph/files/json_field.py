@@ -220,7 +220,7 @@ def json_field(
     outputs = () if output is None else _texts("output", output)
     if not paths or (outputs and len(outputs) != len(paths)):
         raise fail("json_field, output", f"{max(len(paths), 1)} names, one for each path", shown(output))
-    if time_unit not in get_args(TimeUnit):
+    if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
         raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", shown(time_unit))
     stamp = Stamp(time) if isinstance(time, str) else time
     if not isinstance(stamp, Stamp | None):
@@ -312,12 +312,7 @@ def chirpstack(
 
 def _below(prefix: str, path: Paths) -> Paths:
     """Return paths within a part of the message."""
-    if isinstance(path, Yaw):
-        return Yaw(f"{prefix}.{path.path}")
-    if isinstance(path, str):
-        return f"{prefix}.{path}"
-    below: list[Path] = [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in path]
-    return below
+    return [Yaw(f"{prefix}.{one.path}") if isinstance(one, Yaw) else f"{prefix}.{one}" for one in _paths(path)]
 
 
 def _paths(value: object) -> tuple[str | Yaw, ...]:
