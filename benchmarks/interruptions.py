@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from select import select
@@ -31,9 +32,9 @@ def build(noise=0.5):
 CAMPAIGN = """
 network = "net.py:build"
 horizon = 50
-runs = 2000
-chunk = 500
-[settings]
+runs = 4096
+chunk = 512
+[grid]
 noise = [0.1, 0.2, 0.3]
 """
 # A program that is the command, and announces its stages and where it is in reading the network on a pipe.
@@ -76,7 +77,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 SHARES = {"fit": 8, "run": 3, "check": 1, "serve": 3, "demo": 2, "reproduce": 2, "sweep": 1}
 AFTER = 1.5  # seconds, at most, from a stage to the signal
 PATIENCE = 120.0  # seconds in which a command has to end
-KEPT = {"out", "out.csv", "report", "store.db", "store.db-wal", "store.db-shm"}
+KEPT = {"out", "out.csv", "report", "store.db", "store.db-wal", "store.db-shm", "store.db.lock"}
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ def interrupt(name: str, number: signal.Signals, stages: int, after: float, fold
     stage, seen = _stage(process, pipe, stages)
     sleep(after)
     begun = monotonic()
-    process.send_signal(number)
+    with suppress(ProcessLookupError):  # a Ctrl-C is for all processes of the group, a SIGTERM for one
+        (os.killpg if number is signal.SIGINT else os.kill)(process.pid, number)
     try:
         said = process.communicate(timeout=PATIENCE)[1]
     except subprocess.TimeoutExpired:

@@ -121,6 +121,7 @@ class _Worker:
                 stdout=subprocess.PIPE,
                 text=True,
                 encoding="utf-8",
+                process_group=0,  # Ctrl-C in a terminal is for the parent, which decides
             )
             _say(self.process, self.greeting)
         return self.process
