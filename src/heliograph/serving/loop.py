@@ -2,18 +2,58 @@
 
 import asyncio
 import signal
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from time import monotonic
+from typing import Any, Protocol, TypeVar
 
-from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.transport import LOG, Transport
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 
 T = TypeVar("T")
-PATIENCE = (
-    10.0  # seconds that a reader has to take what is left when the service stops; what it does not stays journaled
-)
+PATIENCE, LEAST = (
+    7.0,
+    0.5,
+)  # seconds from a stop to the end, and for each part of it: the rest comes again, or is journaled
+
+
+class Ending:
+    """The end of a service: a stop that may come at any moment, and the time that is left after it.
+
+    The service is called in a thread of its own, which is not waited for in the end.
+    """
+
+    def __init__(self, stop: asyncio.Event):
+        self.stop = stop
+        self._thread, self._begun = ThreadPoolExecutor(1), 0.0
+
+    async def finished(self, work: "asyncio.Future[T]") -> bool:
+        """Wait for work, after a stop for as long as is left; return whether it is done."""
+        stopped = asyncio.ensure_future(self.stop.wait())
+        both: set[asyncio.Future[Any]] = {work, stopped}
+        await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        if not work.done():
+            self._begun = self._begun or monotonic()
+            await asyncio.wait({work}, timeout=max(self._begun + PATIENCE - monotonic(), LEAST))
+        return work.done()
+
+    async def call(self, function: Callable[..., T], *arguments: object) -> T:
+        """Call the service in its thread.
+
+        Raises:
+            AbandonedError: it takes longer than is left after a stop, as where programs are compiled.
+        """
+        work = asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
+        if not await self.finished(work):
+            raise AbandonedError
+        return work.result()
+
+
+class AbandonedError(Exception):
+    """End of a service that was still computing when its time was over: nothing of that is committed."""
 
 
 class Takes(Protocol):
@@ -53,44 +93,45 @@ async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport,
         transport: where messages come from and outputs go; it is closed at the end.
         patience: seconds without messages after which the service takes that nothing came; None for never.
     """
+    ending = Ending(stop)
     try:
-        await _publish(service, transport, service.unpublished(), stop)
-        ended = await _serve(service, transport, stop, patience)
-        await _publish(service, transport, await asyncio.to_thread(service.finish, ended), stop)
-        await asyncio.to_thread(service.finish, False)
+        await _publish(service, transport, service.unpublished(), ending)
+        ended = await _serve(service, transport, ending, patience)
+        await _publish(service, transport, await ending.call(service.finish, ended), ending)
+        await ending.call(service.finish, False)
+    except AbandonedError:
+        LOG.warning("stopped while it computed: the messages that it was taking are not committed, and come again")
     finally:
         await transport.close()
 
 
-async def _serve(service: Takes, transport: Transport, stop: asyncio.Event, patience: float | None) -> bool:
+async def _serve(service: Takes, transport: Transport, ending: Ending, patience: float | None) -> bool:
     """Run the loop; return whether the transport ended."""
+    stop = ending.stop
     while not stop.is_set():
         # The next messages, or after a while that there are none.
         waiting = asyncio.ensure_future(_unless(stop, transport.receive()))
         try:
             while not (await asyncio.wait({waiting}, timeout=patience))[0]:
-                await _publish(service, transport, await asyncio.to_thread(service.take, []), stop)
+                await _publish(service, transport, await ending.call(service.take, []), ending)
         finally:
             waiting.cancel()
         batch = waiting.result()
         if batch is None:
             return not stop.is_set()
-        outputs = await asyncio.to_thread(service.take, batch.payloads)
+        outputs = await ending.call(service.take, batch.payloads)
         await batch.acknowledge()
-        await _publish(service, transport, outputs, stop)
+        await _publish(service, transport, outputs, ending)
     return False
 
 
-async def _publish(service: Takes, transport: Transport, outputs: Sequence[Output], stop: asyncio.Event) -> None:
-    """Publish outputs; after `stop` a reader has PATIENCE seconds, and the rest is published after a restart."""
+async def _publish(service: Takes, transport: Transport, outputs: Sequence[Output], ending: Ending) -> None:
+    """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""
     telling = asyncio.ensure_future(transport.publish(outputs))
-    stopped = asyncio.ensure_future(stop.wait())
-    await asyncio.wait({telling, stopped}, return_when=asyncio.FIRST_COMPLETED)
-    stopped.cancel()
-    try:
-        await asyncio.wait_for(telling, PATIENCE)
-    except TimeoutError:
+    if not await ending.finished(telling):
+        telling.cancel()
         return
+    telling.result()
     service.published(outputs)
 
 

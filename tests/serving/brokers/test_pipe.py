@@ -4,8 +4,8 @@ import asyncio
 import os
 import signal
 from contextlib import suppress
-from threading import Thread, Timer
-from time import sleep
+from threading import Event, Thread, Timer
+from time import monotonic, sleep
 
 import pytest
 
@@ -185,3 +185,19 @@ def test_a_sender_that_is_ahead_fills_a_batch_and_a_reader_gets_all_of_it():
             thread.join()
     os.close(sender)
     assert 32_768 <= count <= 100_000 and known == [sent[: 2 * count]]
+
+
+def test_a_service_that_computes_when_it_is_said_to_stop_is_not_waited_for(monkeypatch, caplog):
+    """As where it compiles programs, which cannot be interrupted: what it was taking comes again."""
+    monkeypatch.setattr(loop, "PATIENCE", 0.1)
+    (source, sender), (reader, target) = os.pipe(), os.pipe()
+    service, computed = Counting(), Event()
+    monkeypatch.setattr(service, "take", lambda payloads: computed.wait(60) and [])
+    os.write(sender, b"m\n")
+    begun = monotonic()
+    serve(service, source, target, after=0.3)
+    assert monotonic() - begun < 20 and service.finished == 0
+    assert "not committed" in caplog.text
+    computed.set()
+    for end in (source, sender, reader, target):
+        os.close(end)
