@@ -181,3 +181,20 @@ def test_no_other_text_is_an_instant(text):
 def test_text_among_numbers_is_no_number():
     with pytest.raises(ValueError, match=r"column 'x': expected numbers or dates, got '2\.0'"):
         columns_of({"x": np.array([1.0, "2.0"], dtype=object)})
+
+
+def test_missing_dates_are_said_where_each_row_is_a_step():
+    """Yearly flows without twenty years; with the input dt they are 21 years, and with all rows nothing is missing."""
+    years = np.array([year for year in range(1871, 1971) if not 1900 <= year <= 1919])
+    plant, sensor = hg.LinearPlant([[1.0]], 1469.0, [1000.0], 1e6), hg.LinearSensor([[1.0]], 15099.0)
+    walk = hg.LinearPlant([[1.0]], lambda u: 1469.0 * u[0].reshape(1, 1), [1000.0], 1e6, inputs=["dt"])
+    z, dates = np.full(80, 900.0), (years - 1970).astype("datetime64[Y]")
+
+    def network(plant):
+        return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"k": hg.kalman_filter(plant, sensor)})})
+
+    for time, said in ((dates, "steps of 1 and 21 years"), (years.astype(float), "steps of 1 and 21:")):
+        with pytest.warns(UserWarning, match=f"time: {said}.* a plant without the input dt takes each for one"):
+            hg.run(network(plant), {"a": z}, time=time)
+    hg.run(network(plant), {"a": np.zeros(100)}, time=np.arange(1871, 1971))
+    hg.run(network(walk), {"a": z}, np.diff(years, prepend=1870)[:, None], time=dates)

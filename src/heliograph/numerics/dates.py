@@ -100,6 +100,23 @@ def seconds_between(time: np.ndarray) -> np.ndarray:
     return np.asarray(np.diff(whole, prepend=whole[:1]) / 1e9)
 
 
+LONGER = 1.5  # times the usual step: then rows are missing; months and leap years differ by less
+SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "hours": 3600.0, "minutes": 60.0}
+
+
+def unequal_steps(time: np.ndarray) -> str:
+    """Say that steps between times differ, "steps of 1 and 21 years"; "" where none is half as long again as usual."""
+    steps = seconds_between(time)[1:]
+    steps = steps[steps > 0]
+    if not steps.size or steps.max() <= LONGER * np.median(steps):
+        return ""
+    usual, longest, unit = float(np.median(steps)), float(steps.max()), ""
+    if time.dtype.kind == "M":
+        unit, span = next(((name, span) for name, span in SPANS.items() if usual >= 0.9 * span), ("seconds", 1.0))
+        usual, longest = round(usual / span, 1), round(longest / span, 1)
+    return f"steps of {usual:g} and {longest:g} {unit}".rstrip()
+
+
 def in_iso(time: np.ndarray) -> np.ndarray:
     """Dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
     there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)

@@ -12,6 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.codegen.engine import computed
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_times, fail, instance, table
+from heliograph.numerics.dates import unequal_steps
 from heliograph.numerics.float64 import check_process, quickly_compiled, to_numpy
 from heliograph.numerics.types import ArrayLike, Float, PyTree, units_in
 from heliograph.simulation.arguments import inputs_of, measurement_of
@@ -28,6 +29,7 @@ from heliograph.smoothing.modes import AbstractSmoothing
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, PyTree]]  # what a recording is filtered with
 
 
+ONE_STEP = "a plant without the input dt takes each for one; insert the rows that are missing, or give it dt"
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
 
 Reports = TypeAliasType("Reports", Mapping[str, Mapping[str, SentReports | ArrayLike]])  # by fusion and node
@@ -83,6 +85,8 @@ def run(
     u = inputs_of(network, inputs, steps)
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
+    if time is not None and TIME_STEP not in network.inputs and (said := unequal_steps(clock)):
+        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=2)
     for name, node in network.nodes.items():
         z[name] = _within(name, node, z[name])
         _warn_of_forbidden(name, node, z[name])
