@@ -149,8 +149,9 @@ def test_each_node_reads_its_sensor_at_topics_of_others_and_a_node_without_one_c
 
     def from_topic(node: str, k: int, values: list[float]) -> Message | str:
         scale = 10.0 if node == "a" else 1.0
-        content = {"t": scale * values[0], "at": (NOON + timedelta(minutes=k)).isoformat()}
-        (message,) = readers[node].read(f"garden/{node}", json.dumps(content).encode(), NOON)
+        now = NOON + timedelta(minutes=k)
+        content = {"t": scale * values[0], "at": now.isoformat()}
+        (message,) = readers[node].read(f"garden/{node}", json.dumps(content).encode(), now)
         assert not readers[node].read(f"garden/{'ac'.replace(node, '')}", b'{"t": 1.0}', NOON)
         return message
 

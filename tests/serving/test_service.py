@@ -45,22 +45,29 @@ def finals(known, plant):
     ]
 
 
-def test_an_output_claims_nothing_where_covariances_are_no_numbers_or_negative():
-    """Saved gains lose their covariance (NaN) where data are missing, the other filter its own from step 2 on."""
+def test_an_output_claims_nothing_where_covariances_are_no_numbers_and_refuses_where_they_are_negative():
+    """Saved gains lose their covariance (NaN) where data are missing.
+
+    The other filter predicts a negative variance from step 2 on: no value can be judged by it, and each is refused.
+    """
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     saved = hg.filters.scheduled_polynomial_filter(plant, sensor, hg.perfect(), 6, 1)
     pair = hg.LinearPlant(0.9 * np.eye(2), 0.1, [0.0, 0.0], 1.0, states=["p", "v"])
     row = hg.LinearSensor([[1.0, 0.0]], 0.1)
     cases = (
-        (hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": saved})}), (0.1, None, 0.2), "exact", 1),
-        (hg.Network(pair, {"a": hg.Node(row, hg.perfect(), {"f": Losing()})}), (0.1, 0.2, 0.3, 0.4), "nominal", 2),
-    )
-    for network, values, claim, lost in cases:
+        (hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": saved})}), (0.1, None, 0.2),
+         {0.0: "exact", 1.0: "none", 2.0: "none"}),
+        (hg.Network(pair, {"a": hg.Node(row, hg.perfect(), {"f": Losing()})}), (0.1, 0.2, 0.3, 0.4),
+         {0.0: "nominal", 1.0: "nominal"}),
+    )  # fmt: skip
+    for network, values, expected in cases:
         sent = [{"node": "a", "sequence": k, "time": k, "values": [z]} for k, z in enumerate(values)]
         service = Service(Fleet(Lanes(network), Options(WINDOW)), InMemoryStore())
         outputs = [json.loads(item.body) for item in [*service.take(lines(sent)), *service.finish(ended=True)]]
         claims = {item["time"]: item["estimates"]["a"]["f"]["claim"] for item in outputs if item["kind"] == "final"}
-        assert claims == {k: claim if k < lost else "none" for k in range(len(values))}
+        assert claims == expected
+        refused = [item["reason"] for item in outputs if item["kind"] == "refused"]
+        assert refused == ["implausible"] * (len(values) - len(expected))
 
 
 @pytest.mark.slow

@@ -74,6 +74,8 @@ def _as_enlarged(believed: Premise, own: Premise) -> Premise:
 
 def joined(premises: Sequence[Premise]) -> Premise:
     """Return the premise of a filter that receives all measurements of these, one after the other; of one plant."""
+    if len(premises) == 1:
+        return premises[0]
     sensors = [premise.sensor for premise in premises if premise.sensor is not None]
     channels = [premise.channel for premise in premises if premise.channel is not None]
     triggers = [p.trigger for p in premises if p.trigger is not None and not isinstance(p.trigger, Periodic)]

@@ -138,7 +138,8 @@ def premise_of_all(network: HasNodes) -> Premise:
     """Return plant, sensors and channels of all nodes together, in their order."""
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
-    return joined([premise_at(network, name) for name in network.names if isinstance(network.nodes[name], Node)])
+    nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
+    return joined([premise_at(network, name) for name in nodes]) if nodes else Premise(network.plant)
 
 
 def beliefs(network: HasNodes) -> Iterator[Belief]:

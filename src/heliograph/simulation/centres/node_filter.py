@@ -17,6 +17,7 @@ from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.premise import believing
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.linalg import symmetrize
@@ -25,6 +26,7 @@ from heliograph.simulation.centres.centre import Apart, observation_model
 from heliograph.simulation.centres.edges import Edges
 from heliograph.simulation.centres.mesh import Mesh, MeshState, Rows
 from heliograph.simulation.centres.messages import OnTheWay, quantized
+from heliograph.simulation.claims import premise_at
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
@@ -143,7 +145,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         needs_joint=False,
         claim=network.claims()[node][fusion],
     )
-    return NodeFilter(
+    made = NodeFilter(
         mesh=mesh,
         measured=sizes,
         quantizer=next(iter(between.quantizers((node,))), None),
@@ -153,6 +155,8 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         inputs=network.inputs,
         received=sizes[0] + sum(_numbers(len(network.states), size) for size in sizes[1:]),
     )
+    # The claim is that of the whole network, which stands here for the node's own part of it.
+    return believing(made, premise_at(network, node))
 
 
 def _check_alone(what: str, network: Network, between: Fusion) -> None:
