@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,6 +19,7 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, components
 
+T = TypeVar("T")
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried
 
 
@@ -179,6 +181,29 @@ def _shape_of(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:
         return first_ if first_ == second else (1,)
     taken = [taken_shape for states in SHORT if (taken_shape := shape(states)) is not None]
     return taken[0] if len(taken) == 1 else (1,)
+
+
+def without_output_names(model: T) -> T:
+    """Return a model with sensors, such as a filter, whose outputs are named y0, y1, ...: no number depends on names.
+
+    Models that differ in these names alone are then of one structure, and one program is for all of them.
+    """
+    unnamed: T = jax.tree.map(_unnamed, model, is_leaf=_is_sensor)
+    return unnamed
+
+
+def _is_sensor(model: object) -> bool:
+    return isinstance(model, AbstractSensor)
+
+
+def _unnamed(model: Any) -> Any:
+    if not _is_sensor(model) or "outputs" not in vars(model):
+        return model
+    parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))
+    bare = jax.tree.unflatten(tree, [_unnamed(part) for part in parts])
+    object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
+    object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
+    return bare
 
 
 def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
-from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor, without_output_names
 from heliograph.model.trigger import AbstractTrigger, Sender
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module, unwritten
@@ -318,13 +318,17 @@ def medium_of(network: Network) -> AbstractMedium:
             groups.append(Silent(len(names)))
             continue
         # Sensor, channel, and where their draws and memories stand.
-        stacked = stack([(nodes[name].sensor, _unnamed(nodes[name].channel, memories[name])) for name in names])
+        sensors = [without_output_names(nodes[name].sensor) for name in names]
+        channels = [_unnamed(nodes[name].channel, memories[name]) for name in names]
+        stacked = stack(list(zip(sensors, channels, strict=True)))
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         memory_rows = np.stack([memories[name] for name in names])
         # What a sender that decides knows: its filter, its rule.
         informed_by = nodes[names[0]].informed_by or nodes[names[0]].predictor
         reference_filter: PyTree = (
-            None if informed_by is None else stack([nodes[name].filters[informed_by] for name in names])
+            None
+            if informed_by is None
+            else stack([without_output_names(nodes[name].filters[informed_by]) for name in names])
         )
         informed_at = None if informed_by is None else places[names[0], informed_by][:2]
         triggers: PyTree = [nodes[name].trigger for name in names]

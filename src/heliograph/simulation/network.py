@@ -18,7 +18,7 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
-from heliograph.model.sensor import AnySensor
+from heliograph.model.sensor import AnySensor, without_output_names
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import anonymous, check_forgets, memories
@@ -118,7 +118,9 @@ class Network(Module):
         self.nodes = nodes_standing(self)
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
-        self.groups = _grouped((name, (_world(n), n.filters, meshes[name])) for name, n in self.nodes.items())
+        self.groups = _grouped(
+            (name, without_output_names((_world(n), n.filters, meshes[name]))) for name, n in self.nodes.items()
+        )
         self.kinds = tuple(
             Kind(g, alike)
             for g, names in enumerate(self.groups)

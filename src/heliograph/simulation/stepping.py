@@ -16,6 +16,7 @@ from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
+from heliograph.model.sensor import without_output_names
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
@@ -73,7 +74,9 @@ class AllFilters(Module):
         # Filters of the nodes, by kind.
         self.alike = tuple(
             Alike(
-                stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
+                stack(
+                    [without_output_names(network.nodes[name].filters[f]) for f in names for name in network.groups[g]]
+                ),
                 g,
                 len(names),
                 len(network.groups[g]),

@@ -33,7 +33,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, given_bounds, weakest
 from heliograph.model.over_time import OverTime, at, at_each_step, first, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles, without_output_names
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
@@ -210,7 +210,9 @@ def gathered(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrice
 
 def observation_model(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> ObservationModel:
     """Stack nodes of one structure."""
-    return ObservationModel(stack(list(sensors)), stack([described(channel) for channel in channels]))
+    return ObservationModel(
+        stack([without_output_names(sensor) for sensor in sensors]), stack([described(channel) for channel in channels])
+    )
 
 
 def described(channel: Channel) -> SecondOrder | OverTime:
