@@ -47,6 +47,7 @@ COMMANDS: dict[Callable[..., object], str] = {
     design: "design.toml --out designed",
     completion: "bash >> ~/.bashrc",
 }
+LIGHT = completion, new  # commands that compute nothing
 for single, arguments in COMMANDS.items():
     app.command(single, help_epilogue=f"Example: heliograph {single.__name__} {arguments}")
 
