@@ -17,7 +17,7 @@ from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modes.multiple_model import receive
-from heliograph.filters.modes.side_information import SideInformation, with_flag
+from heliograph.filters.modes.side_information import SideInformation, append_flag
 from heliograph.filters.smoother_step.base import AbstractSmootherStep, StepTrace
 from heliograph.model.centred import predicted_signal
 from heliograph.model.estimate import Estimate, Innovation
@@ -123,7 +123,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         total = jnp.where(there, log_came, log_nothing)
         after = jax.tree.map(lambda a, b: jnp.where(there, a, b), came, nothing)
         if len(down):
-            known, covariance = with_flag(covariance, down[0])
+            known, covariance = append_flag(covariance, down[0])
             value = jnp.append(value, known)
         following = state._replace(mean=after.mean[0], covariance=after.covariance[0], law=after.label[0, 0])
         return following, Innovation(value, covariance, total)

@@ -14,11 +14,10 @@ from heliograph.filters.gaussian.precise import initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.linear import LinearBelief, Move, corrected_linear, predicted, prior_belief
 from heliograph.filters.modes.modal import claim_of_modes
-from heliograph.filters.modes.side_information import with_flag
+from heliograph.filters.modes.side_information import append_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
-from heliograph.model.fading import uncertain_chain
-from heliograph.model.fading import with_flag as flagged
+from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import at, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import Premise, believing
@@ -106,7 +105,7 @@ class ModeObservedFilter(AbstractSizedFilter):
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         # The flags belong to the innovation; they add nothing to the likelihood.
         for mode in published:
-            flag_innovation, spread = with_flag(spread, mode)
+            flag_innovation, spread = append_flag(spread, mode)
             value = jnp.append(value, flag_innovation)
         belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
@@ -204,5 +203,5 @@ def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: b
             first(channel).outputs + len(memories(channel)),
         ),
     )
-    received = at_each_step(lambda link: flagged(link, late=late), channel) if memories(channel) else channel
+    received = at_each_step(lambda link: with_flag(link, late=late), channel) if memories(channel) else channel
     return believing(filter, Premise(plant, sensor, received))

@@ -26,8 +26,7 @@ from heliograph.filters.modes.modal import (
 )
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, given_bounds
-from heliograph.model.fading import uncertain_chain
-from heliograph.model.fading import with_flag as flagged
+from heliograph.model.fading import uncertain_chain, with_flag
 from heliograph.model.over_time import OverTime, at, at_each_step, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premise import Premise, believing
@@ -170,7 +169,7 @@ class SideInformationFilter(AbstractSizedFilter):
         likelihood = log_density(value, covariance, jnp.abs(z) + jnp.abs(value))
         covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
         if self.flagged:
-            nis, covariance = with_flag(covariance, flag)
+            nis, covariance = append_flag(covariance, flag)
             value = jnp.append(value, nis)
         return after, Innovation(value, covariance, likelihood)
 
@@ -309,7 +308,7 @@ def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
 
-def with_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
+def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Innovation of a flag, which is known and not estimated: 0, or NaN if missing; uncorrelated with everything."""
     nis = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
     lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), nis))
@@ -339,8 +338,7 @@ def side_information_filter(
     Source: the filter of Costa (1994) with moments conditional on the side information.
     """
     check_linear("side-information filter", plant, sensor)
-    start = first(plant)
-    check_link(first(sensor), first(channel), len(start.states))
+    check_link(first(sensor), first(channel), len(first(plant).states))
     initial, steps, known = _described(channel)
     # P(flag | mode); one flag that is always the same where there are none.
     if flags is not None:
@@ -348,23 +346,18 @@ def side_information_filter(
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
+    claim = given_bounds("exact" if known else "nominal", plant, sensor, channel)
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
         channel=over_time(steps) if isinstance(channel, OverTime) else steps[0],
         initial=initial,
         flagged=flags is not None,
-        **sized(
-            given_bounds("exact" if known else "nominal", plant, sensor, channel),
-            start,
-            first(channel).outputs + (flags is not None),
-        ),
+        **sized(claim, first(plant), first(channel).outputs + (flags is not None)),
     )
-    if flags is None:
-        return believing(filter, Premise(plant, sensor, channel))
-    if len(memories(channel)) != 1:  # flags of several chains' joint mode: no channel delivers them
+    if flags is not None and len(memories(channel)) != 1:  # of several chains' joint mode: no channel delivers them
         return filter
-    received = at_each_step(lambda link: flagged(link, chances), channel)
+    received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)
     return believing(filter, Premise(plant, sensor, received))
 
 

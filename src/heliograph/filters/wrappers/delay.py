@@ -22,7 +22,7 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.correction import homogeneous
 from heliograph.filters.linear.plan import PlannedFilter, plan
-from heliograph.filters.modes.side_information import with_flag
+from heliograph.filters.modes.side_information import append_flag
 from heliograph.model.bias import driven_by
 from heliograph.model.channel import Channel, check_link, delayed
 from heliograph.model.enlarged import with_past
@@ -320,7 +320,7 @@ class KnownDelayFilter(AbstractPartFilter):
         base = eqx.tree_at(lambda filter: filter.channel, self.base, here)
         after, innovation = base.correct(state, z, k)
         used = jax.tree.map(lambda new, old: jnp.where(known, new, old), after, state)
-        flag_innovation, covariance = with_flag(innovation.covariance, delay)
+        flag_innovation, covariance = append_flag(innovation.covariance, delay)
         likelihood = jnp.where(known, innovation.log_likelihood, 0.0)
         return used, Innovation(jnp.append(innovation.value, flag_innovation), covariance, likelihood)
 
