@@ -111,3 +111,27 @@ command()"""
     )
     done = subprocess.run([sys.executable, "-c", program, "--help"], capture_output=True, text=True, cwd=folder)
     assert (done.returncode, done.stderr, done.stdout) == (130, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_module_in_c_is_imported_says_nothing(folder, number):
+    """JAX has modules in C that import NumPy: they print what is raised in that, or die of it."""
+    program = (
+        START
+        + f"""
+from heliograph.__main__ import command
+
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy.matrixlib":
+            sys.meta_path.remove(self)
+            signal.raise_signal({int(number)})
+
+sys.meta_path.insert(0, Interrupted())
+command()"""
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "check", "net.py"], capture_output=True, text=True, cwd=folder
+    )
+    assert (done.returncode, done.stderr, done.stdout) == (128 + number, "", "")

@@ -23,7 +23,6 @@ from heliograph.cli.stopping import INTERRUPTED, SIGNALLED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
-from heliograph.numerics.signals import uninterrupted
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
@@ -47,7 +46,6 @@ COMMANDS: dict[Callable[..., object], str] = {
     design: "design.toml --out designed",
     completion: "bash >> ~/.bashrc",
 }
-LIGHT = completion, new  # commands that compute nothing
 for single, arguments in COMMANDS.items():
     app.command(single, help_epilogue=f"Example: heliograph {single.__name__} {arguments}")
 
@@ -72,9 +70,6 @@ def _command(arguments: Sequence[str] | None) -> int:
     # Parse and run; what a user can mend becomes one line on stderr.
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
-        if command in COMMANDS and bound.arguments:  # help and lists compute nothing
-            with uninterrupted():  # modules in C that import it print what interrupts them
-                import numpy  # noqa: F401
         with _plain_warnings():
             code: int | None = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()

@@ -1,29 +1,51 @@
 """Signals to stop, SIGINT and SIGTERM: who handles them within a block, and blocks that they do not interrupt."""
 
 import signal
+from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import current_thread, main_thread
+from importlib.machinery import ExtensionFileLoader
+from threading import Timer, current_thread, main_thread
 from types import FrameType
 
 STOPPING = signal.SIGINT, signal.SIGTERM
+SOON = 0.01  # seconds
+IMPORTS = ExtensionFileLoader.exec_module.__code__.co_filename
 
 
 @contextmanager
 def handlers(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Within a block of the main thread, handle the signals to stop so, but for those that the process ignores.
 
-    A process in the background ignores SIGINT: nobody's Ctrl-C is meant for it.
+    A process in the background ignores SIGINT: nobody's Ctrl-C is meant for it. While a module in C is imported the
+    handler waits: such a module prints what is raised in the Python that it calls, or dies of it.
     """
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if _imports_in_c(frame):
+            again = Timer(SOON, interrupt_main, (number,))
+            again.daemon = True
+            again.start()
+        else:
+            handler(number, frame)
+
     before = {number: signal.getsignal(number) for number in STOPPING}
     try:
         for number, known in before.items():
             if known is not signal.SIG_IGN:
-                signal.signal(number, handler)
+                signal.signal(number, handle)
         yield
     finally:
         for number, known in before.items():
             signal.signal(number, known)
+
+
+def _imports_in_c(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == IMPORTS and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager
