@@ -43,7 +43,6 @@ import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
 def say(stage):
     os.write({pipe}, (stage + "\\n").encode())
-say("start")
 class Finder:
     def find_spec(self, name, path=None, target=None):
         if name in ("heliograph.cli", "heliograph.files.network_file", "jax"):
@@ -62,7 +61,14 @@ class Finder:
             module.progress = progress
 sys.meta_path.insert(0, Finder())
 sys.argv[:1] = ["heliograph"]
-from heliograph.__main__ import command
+from heliograph.__main__ import command  # before this is the interpreter's own start
+wait = signal.signal
+def heard(number, handler):  # the first that the command does
+    signal.signal = wait
+    known = wait(number, handler)
+    say("start")
+    return known
+signal.signal = heard
 command()
 """
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -142,9 +148,7 @@ def _stage(process: "subprocess.Popen[str]", pipe: int, stages: int) -> tuple[st
 
 
 def _damage(name: str, number: signal.Signals, seen: list[str], code: int, said: str, left: tuple[str, ...]) -> str:
-    ended = 128 + number
-    serving = name == "serve" and code == 0
-    if code not in (0, ended) and not serving:
+    if code not in (0, 128 + number, -number):  # the last two are one to a shell
         return f"exit code {code}"
     lines = said.splitlines()
     if len(lines) > 1 or any(not line.startswith("heliograph:") for line in lines):
