@@ -22,7 +22,7 @@ def test_a_network_without_doubts_has_status_0(folder, capsys):
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "Network of 1 node"
     assert said[1] == "plant   Plant of p, v; inputs push, dt"
-    assert said[2] == "remote  pos → Discrete hop → aware (nominal), trusting (nominal)"
+    assert said[2] == "remote  pos → Discrete hop → aware (nominal), trusting (nominal, believes another channel)"
     assert said[-1] == "nothing doubtful"
 
 

@@ -14,6 +14,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.module import readable
 
 MEAN_AND_COVARIANCE = 2  # order of the moments that a linear filter's claim rests on
@@ -101,8 +102,15 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     Args:
         make: a function that makes a filter for a plant, a sensor and a channel.
+
+    Raises:
+        ValueError: no function, or one whose parameters nobody can know.
     """
-    parts, parameters = ("plant", "sensor", "channel", "trigger"), inspect.signature(make)
+    parts = ("plant", "sensor", "channel", "trigger")
+    try:
+        parameters = inspect.signature(make)
+    except (TypeError, ValueError) as error:
+        raise fail("what makes a filter", "a function of a plant, a sensor and a channel", shown(make)) from error
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
