@@ -20,6 +20,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import Belief, beliefs
 from heliograph.simulation.description.diagram import listed, shared
+from heliograph.simulation.description.separable import separate_nodes
 from heliograph.simulation.description.wide_angles import wide_at_the_start
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -45,6 +46,12 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     lines = [*_unobservable(network), *_unbounded(network), *_forgotten(network), *_other_worlds(network)]
     lines += [Doubt(True, words) for words in wide_at_the_start(network)]
     lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in shared(network)]
+    parts = separate_nodes(network)
+    if len(parts) > 1:
+        words = f"independent: nothing couples what {listed([repr(names[0]) for names in parts])} measure"
+        lines.append(
+            Doubt(False, f"{words}; a plant of each, a fleet, is estimated as well, starts sooner, costs less")
+        )
     return sorted(lines, key=lambda doubt: not doubt.serious)
 
 

@@ -1,0 +1,46 @@
+"""Nodes that measure states which nothing couples: plants of their own, written as one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.types import Bool
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+
+def separate_nodes(network: Network) -> list[list[str]]:
+    """Return the nodes by the states that they measure, where no state of one list is coupled with one of another.
+
+    States are coupled by A, by the covariances of w and of x_0, and by a sensor that measures both. Known of linear
+    plants and sensors that do not vary over time; otherwise all nodes are in one list.
+    """
+    nodes = {name: node.sensor for name, node in network.nodes.items() if isinstance(node, Node)}
+    linear = isinstance(network.plant, LinearPlant) and all(isinstance(s, LinearSensor) for s in nodes.values())
+    if not linear or len(nodes) < len(network.nodes):
+        return [list(network.nodes)]
+    measured = {name: _measured(sensor) for name, sensor in nodes.items()}
+    coupled = _coupled(network.plant)
+    for states in measured.values():
+        coupled |= states[:, None] & states
+    _, parts = connected_components(coupled, directed=False)
+    by_part: dict[int, list[str]] = {}
+    for name, states in measured.items():
+        by_part.setdefault(int(parts[int(np.argmax(states))]), []).append(name)
+    return list(by_part.values())
+
+
+def _measured(sensor: object) -> Bool[np.ndarray, " states"]:
+    assert isinstance(sensor, LinearSensor)
+    return np.asarray(np.any(np.asarray(sensor.matrix) != 0, axis=0))
+
+
+def _coupled(plant: object) -> Bool[np.ndarray, "states states"]:
+    assert isinstance(plant, LinearPlant)
+    u = jnp.ones(len(plant.inputs))
+    with jax.enable_x64(True):
+        matrices = plant.transition_matrix(u), plant.noise_covariance(u), plant.initial_covariance
+    return np.asarray(sum(np.asarray(matrix) != 0 for matrix in matrices) > 0)
