@@ -32,7 +32,12 @@ def losing():
     """A network whose one filter claims a covariance that is none from its third step on."""
     plant = hg.LinearPlant([[1, 1], [0, 1]], 1e-9, [0.0, 0.0], 1.0, states=("p", "v"))
     sensor = hg.LinearSensor([[1, 0]], 1.0)
-    return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": Losing(claim="exact")})})
+    return hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": losing_filter(plant, sensor)})})
+
+
+@hg.filters.believes
+def losing_filter(plant, sensor):
+    return Losing(claim="exact")
 
 
 def test_a_record_says_of_each_row_what_is_claimed():

@@ -189,6 +189,6 @@ def test_a_map_without_a_draw_says_so():
     class Nothing(AbstractRandomAffine):
         pass
 
-    with pytest.raises(NotImplementedError, match="neither sample nor draw"):
+    with pytest.raises(ValueError, match="Nothing: expected a method sample of its own"):
         Nothing().sample(jax.random.key(0))
     assert eqx.tree_equal(Nothing(), Nothing())

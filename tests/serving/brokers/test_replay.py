@@ -20,7 +20,8 @@ ROWS = 20
 def test_a_replayed_recording_gives_the_estimates_of_run(tmp_path, whole, dated):
     """To 1e-9: dates keep microseconds, which the time between rows is a multiple of; else 1e-12, as two programs."""
     network, chance = stepping() if whole else moving(), np.random.default_rng(1)
-    time = np.cumsum(chance.integers(1, 9, ROWS) / 8)
+    # Where each row is one step, steps are alike.
+    time = np.arange(ROWS) / 2 if whole else np.cumsum(chance.integers(1, 9, ROWS) / 8)
     dt = np.diff(time, prepend=time[:1])
     u = chance.normal(size=(ROWS, 1)) if whole else np.stack([chance.normal(size=ROWS), dt], axis=1)
     z = {node: chance.normal(size=(ROWS, 1)) for node in "ab"}

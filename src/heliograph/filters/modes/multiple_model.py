@@ -170,8 +170,10 @@ def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[B
     law = jnp.sum(weight, axis=0)
     some = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
     share = jnp.where(some, weight * (1 / jnp.where(some, law, 1.0)), 1 / len(weight))
-    center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
-    apart = mean[:, None] - center
+    # About the first: of means so large that all are equal nothing is left, and no rounding to be squared.
+    from_first = (mean - mean[0])[:, None]
+    shift = jnp.sum(share[:, :, None] * from_first, axis=0)
+    center, apart = mean[0] + shift, from_first - shift
     inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
     spread = jnp.sum(share[:, :, None, None] * inside, axis=0)
     return Belief(center, jnp.moveaxis(symmetric(jnp.moveaxis(spread, 0, 2)), 2, 0)), law
