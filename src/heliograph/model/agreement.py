@@ -194,6 +194,8 @@ def _same_gains(believed: Premise, own: Premise) -> bool:
 
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
     """Test whether two channels agree, their memories told apart by where they stand; `loses`: whatever is lost."""
+    if a is b:
+        return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
         return _same_map(anonymous(a), anonymous(b), order, loses)
     if same(anonymous(a), anonymous(b)):
