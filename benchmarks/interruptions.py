@@ -80,6 +80,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "reproduce": ("reproduce", "quadratic-bias", "--out", "out", "--runs", "200"),
     "sweep": ("sweep", "campaign.toml", "--out", "out", "--workers", "1"),
 }
+STAGES = {"fit": 14, "run": 6, "check": 3, "serve": 3, "demo": 7, "reproduce": 7, "sweep": 3}  # that are announced
 SHARES = {"fit": 8, "run": 3, "check": 1, "serve": 3, "demo": 2, "reproduce": 2, "sweep": 1}
 AFTER = 1.5  # seconds, at most, from a stage to the signal
 PATIENCE = 120.0  # seconds in which a command has to end
@@ -139,7 +140,7 @@ def interrupt(name: str, number: signal.Signals, stages: int, after: float, fold
 def _stage(process: "subprocess.Popen[str]", pipe: int, stages: int) -> tuple[str, list[str]]:
     """Wait for so many announcements, or until there are no more for a while."""
     seen: list[str] = []
-    while len(seen) < stages and process.poll() is None and select([pipe], [], [], 20.0 if seen else 60.0)[0]:
+    while len(seen) < stages and process.poll() is None and select([pipe], [], [], 3.0 if seen else 60.0)[0]:
         text = os.read(pipe, 65536).decode()
         if not text:
             break
@@ -167,7 +168,7 @@ def interruptions(count: int, seed: int = 0, names: tuple[str, ...] = tuple(COMM
     for _ in range(count):
         name = chance.choices(names, [SHARES[name] for name in names])[0]
         number = chance.choice([signal.SIGINT, signal.SIGTERM])
-        stages, after = chance.randint(1, 14), chance.uniform(0, AFTER) * chance.choice([0.1, 1.0])
+        stages, after = chance.randint(1, STAGES[name]), chance.uniform(0, AFTER) * chance.choice([0.1, 1.0])
         with tempfile.TemporaryDirectory() as place:
             prepared(Path(place))
             results.append(interrupt(name, number, stages, after, Path(place)))
@@ -176,9 +177,11 @@ def interruptions(count: int, seed: int = 0, names: tuple[str, ...] = tuple(COMM
 
 if __name__ == "__main__":
     total, damaged = int(sys.argv[1]) if len(sys.argv) > 1 else 200, 0
+    in_time = 0  # before the command was done
     for index in range(total):
         (one,) = interruptions(1, index)
         damaged += bool(one.damage)
+        in_time += one.code != 0 or one.command == "serve"
         print(json.dumps(asdict(one)), flush=True)
-    print(json.dumps({"interruptions": total, "with_damage": damaged}))
+    print(json.dumps({"interruptions": total, "in_time": in_time, "with_damage": damaged}))
     sys.exit(damaged > 0)
