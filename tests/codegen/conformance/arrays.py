@@ -1,4 +1,3 @@
-# ruff: noqa: E501, E731
 """Cases of operations on arrays: indices in and out of range, known or of the data; reductions; what moves entries."""
 
 from collections.abc import Callable
@@ -54,7 +53,10 @@ def _indexed(
 def _gathers() -> list[Case]:
     cases = []
     for mode in MODES:
-        get = lambda x, k, m=mode: x.at[k].get(mode=m)
+
+        def get(x, k, m=mode):
+            return x.at[k].get(mode=m)
+
         for dtype in DTYPES:
             cases += _indexed(get, array(dtype, 5), kinds=WHOLE if dtype == np.float64 else WHOLE[:1], label=mode)
         cases += _indexed(get, array(np.float64, 40), label=mode)
@@ -103,7 +105,10 @@ def _gathers() -> list[Case]:
 def _slices() -> list[Case]:
     cases = []
     for size in (1, 3):
-        cut = lambda x, k, n=size: lax.dynamic_slice(x, (k,), (n,))
+
+        def cut(x, k, n=size):
+            return lax.dynamic_slice(x, (k,), (n,))
+
         cases += [c for d in DTYPES for c in _indexed(cut, array(d, 5))]
         cases += _indexed(cut, array(np.float64, 40)) + _indexed(cut, array(np.float64, 300))
     cases += _indexed(lambda x, k: lax.dynamic_slice(x, (k, k), (2, 2)), array(np.float64, 4, 3))
@@ -115,7 +120,10 @@ def _slices() -> list[Case]:
 def _updates() -> list[Case]:
     cases = []
     for size in (1, 3):
-        put = lambda x, k, n=size: lax.dynamic_update_slice(x, x[:n] * 0, (k,))
+
+        def put(x, k, n=size):
+            return lax.dynamic_update_slice(x, x[:n] * 0, (k,))
+
         cases += [c for d in DTYPES if d != np.bool_ for c in _indexed(put, array(d, 5))] + _indexed(
             put, array(np.float64, 40)
         )
@@ -304,28 +312,58 @@ def _moves(function: Callable[..., Any], *shapes: tuple[int, ...]) -> list[Case]
 
 SMALL, LONG = (3, 4), (50, 2)
 CASES: dict[str, list[Case]] = {
-    "gather": _gathers(), "dynamic_slice": _slices(), "dynamic_update_slice": _updates(), "sort": _sorts(),
-    "scatter": _scatters("set"), "scatter-add": _scatters("add"), "scatter-mul": _scatters("multiply"),
-    "scatter-min": _scatters("min"), "scatter-max": _scatters("max"), "scatter-sub": _scatters("subtract"),
+    "gather": _gathers(),
+    "dynamic_slice": _slices(),
+    "dynamic_update_slice": _updates(),
+    "sort": _sorts(),
+    "scatter": _scatters("set"),
+    "scatter-add": _scatters("add"),
+    "scatter-mul": _scatters("multiply"),
+    "scatter-min": _scatters("min"),
+    "scatter-max": _scatters("max"),
+    "scatter-sub": _scatters("subtract"),
     "reduce_sum": _reductions(_by("reduce_sum"), NUMBERS, EXACT),
     "reduce_prod": _reductions(_by("reduce_prod"), NUMBERS, POWERS),
-    "reduce_max": _reductions(_by("reduce_max")), "reduce_min": _reductions(_by("reduce_min")),
+    "reduce_max": _reductions(_by("reduce_max")),
+    "reduce_min": _reductions(_by("reduce_min")),
     "reduce_or": _reductions(_by("reduce_or"), DISCRETE),
     "reduce_and": _reductions(_by("reduce_and"), DISCRETE),
     "reduce_xor": _reductions(_by("reduce_xor"), DISCRETE),
-    "cumsum": _cumulative(lax.cumsum, EXACT, NUMBERS), "cumprod": _cumulative(lax.cumprod, POWERS, NUMBERS),
-    "cummax": _cumulative(lax.cummax), "cummin": _cumulative(lax.cummin),
-    "argmax": _arg(lax.argmax), "argmin": _arg(lax.argmin), "dot_general": _products(),
-    "broadcast_in_dim": _moves(lambda x: (jnp.broadcast_to(x[:1], (5, *x.shape)), jnp.broadcast_to(x[:, :1], x.shape)), SMALL, LONG),
-    "concatenate": _moves(lambda x: (jnp.concatenate([x, x[::-1]]), jnp.concatenate([x, x], 1), jnp.concatenate([x[:0], x])), SMALL, LONG),
-    "expand_dims": _moves(lambda x: x[:, None], SMALL, LONG), "reshape": _moves(lambda x: x.reshape(-1, 2), SMALL, LONG),
+    "cumsum": _cumulative(lax.cumsum, EXACT, NUMBERS),
+    "cumprod": _cumulative(lax.cumprod, POWERS, NUMBERS),
+    "cummax": _cumulative(lax.cummax, dtypes=NUMBERS),
+    "cummin": _cumulative(lax.cummin, dtypes=NUMBERS),
+    "argmax": _arg(lax.argmax),
+    "argmin": _arg(lax.argmin),
+    "dot_general": _products(),
+    "broadcast_in_dim": _moves(
+        lambda x: (jnp.broadcast_to(x[:1], (5, *x.shape)), jnp.broadcast_to(x[:, :1], x.shape)), SMALL, LONG
+    ),
+    "concatenate": _moves(
+        lambda x: (jnp.concatenate([x, x[::-1]]), jnp.concatenate([x, x], 1), jnp.concatenate([x[:0], x])), SMALL, LONG
+    ),
+    "expand_dims": _moves(lambda x: x[:, None], SMALL, LONG),
+    "reshape": _moves(lambda x: x.reshape(-1, 2), SMALL, LONG),
     "rev": _moves(lambda x: (x[::-1], x[:, ::-1], jnp.flip(x)), SMALL, LONG),
     "slice": _moves(lambda x: (x[1:], x[::2], x[1:1], x[-1:, 1::3]), SMALL, LONG),
-    "split": _moves(lambda x: jnp.split(x, [1, 2]), SMALL, LONG), "squeeze": _moves(lambda x: jnp.squeeze(x[:1], 0), SMALL, LONG),
-    "stack": _moves(lambda x: (jnp.stack([x, x]), jnp.stack([x, x], -1)), SMALL), "tile": _moves(lambda x: lax.tile(x, (2, 3)), SMALL),
-    "transpose": _moves(lambda x: x.T, SMALL, LONG), "unstack": _moves(jnp.unstack, SMALL),
-    "pad": _moves(lambda x: [lax.pad(x, x[0, 0], c) for c in ([(1, 2, 0), (0, 0, 1)], [(-1, 1, 2), (2, -1, 0)], [(0, 0, 0), (-2, -2, 0)])], SMALL),
-    "iota": [Case(lambda x, d=d: (lax.iota(d, 5), lax.broadcasted_iota(d, (2, 3), 1), lax.iota(d, 0)), (np.zeros(2),)) for d in DTYPES if d != np.bool_],
-    "empty": [], "empty2": [],
-}  # fmt: skip
+    "split": _moves(lambda x: jnp.split(x, [1, 2]), SMALL, LONG),
+    "squeeze": _moves(lambda x: jnp.squeeze(x[:1], 0), SMALL, LONG),
+    "stack": _moves(lambda x: (jnp.stack([x, x]), jnp.stack([x, x], -1)), SMALL),
+    "tile": _moves(lambda x: lax.tile(x, (2, 3)), SMALL),
+    "transpose": _moves(lambda x: x.T, SMALL, LONG),
+    "unstack": _moves(jnp.unstack, SMALL),
+    "pad": _moves(
+        lambda x: [
+            lax.pad(x, x[0, 0], c) for c in ([(1, 2, 0), (0, 0, 1)], [(-1, 1, 2), (2, -1, 0)], [(0, 0, 0), (-2, -2, 0)])
+        ],
+        SMALL,
+    ),
+    "iota": [
+        Case(lambda x, d=d: (lax.iota(d, 5), lax.broadcasted_iota(d, (2, 3), 1), lax.iota(d, 0)), (np.zeros(2),))
+        for d in DTYPES
+        if d != np.bool_
+    ],
+    "empty": [],
+    "empty2": [],
+}
 CASES |= {"scatter_add": CASES["scatter-add"], "scatter_mul": CASES["scatter-mul"]}

@@ -15,7 +15,7 @@ from tests.codegen.conformance.case import Case
 from tests.codegen.conformance.engines import program_of
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
-STRICT = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
+STRICT = ("-O0", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 
 def by_c(cases: Sequence[Case], folder: Path, compiler: str, quiet: bool = False) -> list[list[np.ndarray]]:

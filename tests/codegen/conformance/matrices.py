@@ -1,4 +1,3 @@
-# ruff: noqa: E501, E731
 """Cases of decompositions and special functions: singular, indefinite and zero matrices, NaN among the entries."""
 
 import jax
@@ -13,11 +12,23 @@ SQUARE = RANDOM.normal(size=(3, 3))
 DEFINITE = SQUARE @ SQUARE.T + np.eye(3)
 MISSING = DEFINITE.copy()
 MISSING[1, 1] = np.nan
-MATRICES = np.stack([
-    DEFINITE, -DEFINITE, np.zeros((3, 3)), np.eye(3), np.ones((3, 3)), np.diag([1.0, 0.0, 2.0]), np.diag([1.0, -1.0, 2.0]),
-    np.diag([1.0, 2.0, -1e-20]), np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[1.0, 2, 0], [2, 4, 0], [0, 0, 1]]),
-    1e200 * DEFINITE, 1e-200 * DEFINITE, MISSING,
-])  # fmt: skip
+MATRICES = np.stack(
+    [
+        DEFINITE,
+        -DEFINITE,
+        np.zeros((3, 3)),
+        np.eye(3),
+        np.ones((3, 3)),
+        np.diag([1.0, 0.0, 2.0]),
+        np.diag([1.0, -1.0, 2.0]),
+        np.diag([1.0, 2.0, -1e-20]),
+        np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+        np.array([[1.0, 2, 0], [2, 4, 0], [0, 0, 1]]),
+        1e200 * DEFINITE,
+        1e-200 * DEFINITE,
+        MISSING,
+    ]
+)
 KNOWN = MATRICES[:-1]  # LAPACK passes over NaN when it seeks a pivot
 GENERAL = np.concatenate([KNOWN, RANDOM.normal(size=(3, 3, 3)), np.array([[[0.0, 2, 1], [0, 1, 1], [0, 3, 2]]])])
 VECTORS = RANDOM.normal(size=(len(GENERAL), 3))
@@ -40,7 +51,10 @@ def _triangular() -> list[Case]:
                     return jax.scipy.linalg.solve_triangular(a, b, lower=how[0], trans=how[1], unit_diagonal=how[2])
 
                 cases.append(Case(solve, (GENERAL, VECTORS), ROUNDED, f"{lower} {transposed} {unit}"))
-    right = lambda a, b: lax.linalg.triangular_solve(a, jnp.stack([b, 2 * b]), left_side=False, lower=True)
+
+    def right(a, b):
+        return lax.linalg.triangular_solve(a, jnp.stack([b, 2 * b]), left_side=False, lower=True)
+
     return [*cases, Case(right, (GENERAL, VECTORS), ROUNDED, "right")]
 
 
@@ -55,13 +69,21 @@ CASES: dict[str, list[Case]] = {
     "cholesky": [Case(jnp.linalg.cholesky, (m,), ROUNDED) for m in (MATRICES, _of_one(MATRICES))],
     "triangular_solve": _triangular(),
     "lu": [
-        Case(lambda a: lax.linalg.lu(a), (GENERAL,), ROUNDED), Case(lambda a: lax.linalg.lu(a), (_of_one(GENERAL),)),
+        Case(lambda a: lax.linalg.lu(a), (GENERAL,), ROUNDED),
+        Case(lambda a: lax.linalg.lu(a), (_of_one(GENERAL),)),
         Case(lambda a: jnp.linalg.det(a), (GENERAL[:-1],), ROUNDED),
     ],
-    "custom_linear_solve": [Case(jnp.linalg.solve, (GENERAL, VECTORS), ROUNDED), Case(jnp.linalg.inv, (GENERAL,), ROUNDED)],
-    "eigh": [Case(jnp.linalg.eigvalsh, (KNOWN[:7],), ROUNDED), Case(jnp.linalg.eigvalsh, (_of_one(MATRICES),), ROUNDED)],
-    "igamma": [Case(jax.scipy.special.gammainc, _masses(), 1e6)], "igammac": [Case(jax.scipy.special.gammaincc, _masses(), 1e6)],
+    "custom_linear_solve": [
+        Case(jnp.linalg.solve, (GENERAL, VECTORS), ROUNDED),
+        Case(jnp.linalg.inv, (GENERAL,), ROUNDED),
+    ],
+    "eigh": [
+        Case(jnp.linalg.eigvalsh, (KNOWN[:7],), ROUNDED),
+        Case(jnp.linalg.eigvalsh, (_of_one(MATRICES),), ROUNDED),
+    ],
+    "igamma": [Case(jax.scipy.special.gammainc, _masses(), 1e6)],
+    "igammac": [Case(jax.scipy.special.gammaincc, _masses(), 1e6)],
     "digamma": of_each_type(jax.scipy.special.digamma, 1, 1e4, dtypes=(np.float64,)),
     "bessel_i0e": of_each_type(jax.scipy.special.i0e, 1, 20.0, dtypes=(np.float64,)),
     "bessel_i1e": of_each_type(jax.scipy.special.i1e, 1, 20.0, dtypes=(np.float64,)),
-}  # fmt: skip
+}
