@@ -266,16 +266,19 @@ def of_relays(world, believed, of_receiver):
     local = hg.filters.ScheduledFilter(schedules.pop("receiver"))
     gains = hg.relays.local_error_design(of_receiver, 4).gains
     best = hg.filters.LinearSystemFilter(hg.relays.receiver_system(of_receiver, gains))
-    return hg.Network.of_relays(world, schedules, {"local": local, "best": best}).claims()
+    return hg.Network.of_relays(world, schedules, {"local": local, "best": best})
 
 
 @pytest.mark.slow
 def test_relays_and_their_receiver_believe_hops_and_the_gains_that_run():
-    assert of_relays(relayed(), relayed(), relayed()) == {
+    network = of_relays(relayed(), relayed(), relayed())
+    assert network.claims() == {
         "relay": {"local": "exact"}, "receiver": {"local": "exact", "best": "exact"},
     }  # fmt: skip
-    assert of_relays(relayed(), relayed(2.0), relayed(2.0)) == {
+    alone = hg.run(network, {"receiver": np.zeros((4, 1))})  # a recording without what the relay received
+    assert {estimate.claim for estimate in alone.estimates["receiver"].values()} == {"exact"}
+    assert of_relays(relayed(), relayed(2.0), relayed(2.0)).claims() == {
         "relay": {"local": "nominal"}, "receiver": {"local": "nominal", "best": "nominal"},
     }  # fmt: skip
-    others = of_relays(relayed(), relayed(), relayed(own=0.4))
+    others = of_relays(relayed(), relayed(), relayed(own=0.4)).claims()
     assert others["receiver"] == {"local": "exact", "best": "nominal"}
