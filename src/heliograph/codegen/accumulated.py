@@ -27,6 +27,17 @@ class Accumulated:
         self.blocks = Tiers(self.code.blocks, (narrow(), WIDEST))
         self.once = None if self.code.once is None else Tiers(self.code.once, (1, 1))
 
+    def memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
+        """Bytes of results of so many single runs, of sums of so many lanes, and of variables of those in flight."""
+        length = row_length(WIDEST, self.summed.batches)
+        collected = sums = 0.0
+        for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
+            if summed:
+                sums += 8.0 * buffer.size * length
+            elif not common:
+                collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
+        return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
+
     def begin(self, arguments: Sequence[Any], runs: int) -> "Begun":
         """Compute everything that the runs share, from the arguments other than the number of the run.
 

@@ -1,5 +1,6 @@
 """Monte Carlo: the world and every filter in it, simulated run by run in blocks."""
 
+import os
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -23,9 +24,10 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record, warn_of_no_numbers
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import each_run, trajectories
+from heliograph.simulation.runs.by_run import each_run, read_by, trajectories
 from heliograph.simulation.runs.lanes import (
     BLOCK,
+    LANES,
     Lanes,
     Shared,
     added,
@@ -34,6 +36,7 @@ from heliograph.simulation.runs.lanes import (
     is_shared,
     one_processor,
 )
+from heliograph.simulation.runs.memory import Needed, check_memory, out_of_memory, size_of
 from heliograph.simulation.runs.native import natively
 from heliograph.simulation.smoothed import Recorded, Smoother, finished, reduced_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
@@ -85,7 +88,8 @@ def monte_carlo(
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
-            that is no multiple of 32, an unknown precision, a filter or fusion that cannot be smoothed.
+            that is no multiple of 32, an unknown precision, a filter or fusion that cannot be smoothed, more memory
+            than is available.
     """
     check_process()
     instance("network", network, Network, "a Network")
@@ -101,14 +105,18 @@ def monte_carlo(
     smoothing = None if smooth is None else smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
     if not single and one_processor() and not any(mesh.is_long for mesh in meshes_of(network).values()):
-        by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
+        with out_of_memory(runs, horizon):
+            by_native_code = natively(network, u, base, reducer, first_run, runs, chunk, progress, smoothing)
         if by_native_code is not None:
             return _warned(by_native_code, network)
     # Otherwise XLA: the world, and what is collected of it.
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
     job = _Job(world, smoothing and smoothing.smoother(filters), u, base, np.asarray(first_run + runs), reducer, single)
-    recorded = _recorded(job, first_run, runs, chunk, progress)
+    if one_processor():
+        check_memory(_needed(job, runs, chunk), runs, horizon)
+    with out_of_memory(runs, horizon):
+        recorded = _recorded(job, first_run, runs, chunk, progress)
     return _warned(finished(reducer, recorded, network, smoothing), network)
 
 
@@ -206,16 +214,7 @@ def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTr
 
 def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     """Sums by batch of one block of runs and flags likewise, and what is collected, (run, time, ...)."""
-    if job.single:
-        with jax.enable_x64(False):
-            world, inputs = jax.tree.map(_single, (job.world, job.inputs))
-            outputs = _trajectories(world, inputs, job.key, runs)
-        outputs = jax.tree.map(
-            lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs
-        )
-    else:
-        outputs = _trajectories(job.world, job.inputs, job.key, runs)
-    recorded = _reduced(job.reducer, job.later, outputs)
+    recorded = _reduced(job.reducer, job.later, _outputs(job, runs))
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     # What all runs share stands as of one; of the others the axis of runs becomes one of batches, without padding.
@@ -227,6 +226,38 @@ def _block(job: _Job, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     sums, ever = jax.tree.map(summed, (recorded.sums, recorded.ever))
     collected = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), recorded.collected)
     return (sums, ever), collected
+
+
+def _outputs(job: _Job, runs: jax.Array) -> PyTree:
+    """Trajectories of one block of runs, (run, time, ...), in double precision whatever they were simulated in."""
+    if not job.single:
+        return _trajectories(job.world, job.inputs, job.key, runs)
+    with jax.enable_x64(False):
+        world, inputs = jax.tree.map(_single, (job.world, job.inputs))
+        outputs = _trajectories(world, inputs, job.key, runs)
+    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
+
+
+def _needed(job: _Job, runs: int, chunk: int) -> Needed:
+    """Memory of a simulation by XLA on a processor, from its shapes.
+
+    Sums stand once in each lane; a lane in flight also has those after its block, and rows of batches from which they
+    are made. Of trajectories the program has those that its reducer reads.
+    """
+    with jax.enable_x64(True):
+        block = np.arange(BLOCK)
+        sums, collected = eqx.filter_eval_shape(_block, job, block)
+        outputs = eqx.filter_eval_shape(_outputs, job, block)
+        read = read_by(partial(_reduced, job.reducer, job.later), outputs)
+    blocks, at_once = -(-runs // BLOCK), -(-min(runs, chunk) // BLOCK)
+    in_flight = 1 if job.world.filters.meshes else min(LANES, at_once, os.cpu_count() or 1)
+    rows = size_of(sums) * (BATCHES + BLOCK - 1) / BATCHES
+    kept = blocks * size_of(collected)
+    return Needed(
+        2 * kept,  # by chunk, then joined, when no trajectories are left
+        min(LANES, blocks) * size_of(sums) + in_flight * (size_of(sums) + rows),
+        max(0.0, in_flight * size_of(read) - kept),
+    )
 
 
 def by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:

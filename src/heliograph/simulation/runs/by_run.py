@@ -70,6 +70,14 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
 
+def read_by(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
+    """Leaves of values (or their shapes) that a result of the function depends on."""
+    leaves, tree = jax.tree.flatten(values)
+    traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
+    used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))[1]
+    return [leaf for leaf, u in zip(leaves, used, strict=True) if u]
+
+
 def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
     return any(v and u for v, u in zip(varies, used, strict=True))
 

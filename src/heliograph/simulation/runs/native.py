@@ -4,6 +4,7 @@ The program is made once for networks that differ in numbers alone: their arrays
 Their zeros and ones are known when the program is made, to save operations.
 """
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, reduce
 from typing import Any, NamedTuple
@@ -29,6 +30,7 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
 from heliograph.simulation.runs.lanes import BLOCK, LANES, Progress, batch_counts, in_chunks
+from heliograph.simulation.runs.memory import Needed, check_memory
 from heliograph.simulation.smoothed import Part, Recorded, Smoother, finished, reduced_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
@@ -52,14 +54,16 @@ def native(
     reducer: AbstractReducer[Any],
     runs: int,
     later: Smoother | None = None,
+    parts: int = 1,
 ) -> Native:
     """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
 
     `runs`: how many will follow. With `later`, the results are a pair: of filtered and of smoothed estimates; and sums
-    of the NIS.
+    of the NIS. `parts`: of a network, of which this is one, whose results are held together.
 
     Raises:
         Unsupported: a program that native code does not support.
+        ValueError: more memory than is available.
     """
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
@@ -78,6 +82,9 @@ def native(
     if isinstance(made, Unsupported):
         raise Unsupported(made.operation, made.where)
     program, form = made
+    lanes = min(LANES, -(-runs // BLOCK))
+    collected, sums, variables = program.memory(runs, lanes, min(lanes, os.cpu_count() or 1))
+    check_memory(Needed(parts * collected, sums, variables), runs, len(inputs))
     words = np.asarray(jax.random.key_data(key))
     return Native(program.begin([words, *(a for a in arrays if _is_given(a))], runs), form)
 
@@ -250,7 +257,7 @@ def natively(
     # Many independent nodes: one program for a few of them, with other numbers.
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
-        code = attempted(lambda: _code(some, inputs, key, reducer, runs))  # noqa: B023
+        code = attempted(lambda: _code(some, inputs, key, reducer, runs, parts=len(parts)))  # noqa: B023
         if code is None:
             return None
 
@@ -283,10 +290,11 @@ def _code(
     reducer: AbstractReducer[Any],
     runs: int,
     smoothing: Part | None = None,
+    parts: int = 1,
 ) -> Native:
     filters = AllFilters(network, smoothing and smoothing.kinds)
     world = World(network.plant, medium_of(network), filters)
-    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters))
+    return native(world, inputs, key, reducer, runs, smoothing and smoothing.smoother(filters), parts)
 
 
 def _recorded(code: Native, first_run: int, runs: int, chunk: int, progress: Progress | None) -> Recorded:

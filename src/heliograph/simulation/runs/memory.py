@@ -1,0 +1,84 @@
+"""Memory that runs need, known from shapes before any of them starts; what does not fit is refused in one line."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
+
+GB = 1e9
+MEMINFO = Path("/proc/meminfo")  # of Linux, which counts what the cache of files would give back
+LESS = "a shorter horizon, or fewer nodes or filters at once"
+FEWER = f"fewer runs at once (`first_run` goes on from there), keep=Statistics(), or {LESS}"
+
+
+class Needed(NamedTuple):
+    """Bytes that runs hold at the same time.
+
+    `collected` of single runs, `sums` over runs by step and batch, and `trajectories` of the runs in flight.
+    """
+
+    collected: float
+    sums: float
+    trajectories: float
+
+
+def size_of(tree: PyTree) -> float:
+    """Bytes of the arrays of a tree, or of their shapes."""
+    return float(sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)))
+
+
+def available() -> float | None:
+    """Bytes that this machine can still give, at most all of its memory; None where it does not say."""
+    try:
+        lines = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
+        return 1024.0 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):  # no POSIX, or a system that does not tell
+        return None
+
+
+def check_memory(needed: Needed, runs: int, horizon: int) -> None:
+    """Refuse runs that need more memory than there is.
+
+    Raises:
+        ValueError: more is needed, with both numbers, the largest part, and what needs less.
+    """
+    total, free = sum(needed), available()
+    if free is None or total <= free:
+        return
+    part, most = max(needed._asdict().items(), key=lambda item: item[1])
+    less = FEWER if part == "collected" else LESS
+    got = f"{total / GB:.3g} GB for runs={runs}, horizon={horizon}, {most / GB:.3g} GB of them {_WORDS[part]}: {less}"
+    raise fail("memory of a simulation", f"at most {free / GB:.3g} GB, which are available", got)
+
+
+@contextmanager
+def out_of_memory(runs: int, horizon: int) -> Iterator[None]:
+    """Say in one line that memory was not given after all, in place of an allocator's text.
+
+    Raises:
+        ValueError: an allocation that failed.
+    """
+    try:
+        yield
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        got = f"none for runs={runs}, horizon={horizon} ({str(error).splitlines()[0][:100]}): {FEWER}"
+        raise fail("memory of a simulation", "what the system gives", got) from None
+
+
+_WORDS = {
+    "collected": "results of single runs",
+    "sums": "sums by step and batch of runs",
+    "trajectories": "trajectories of runs side by side",
+}
