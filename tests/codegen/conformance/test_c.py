@@ -10,7 +10,6 @@ from tests.codegen.conformance.engines import by_xla
 from tests.codegen.conformance.test_native import CASES, ONE_AT_A_TIME, compare, some, thinned
 
 LEFT_OUT = {*ONE_AT_A_TIME, "lgamma"}  # the sign that lgamma returns beside is a variable of the C library
-FOURTEEN_DIGITS = ("cbrt", "cosh", "sinh", "exp2")  # of XLA's code; the C library has all
 MOST = 8  # runs of a case
 
 
@@ -32,8 +31,7 @@ def written(cases: list[Case], folder) -> list[Case]:
 def test_a_rule_computes_in_c_what_xla_computes(name, tmp_path):
     if name in LEFT_OUT:
         pytest.skip("a loop, or a function of the C library's own")
-    least = 256.0 if name in FOURTEEN_DIGITS else 8.0
-    cases = [c._replace(units=c.units and max(c.units, least)) for c in some(CASES[name], 6)]
+    cases = [c._replace(units=c.units and max(c.units, 8.0)) for c in some(CASES[name], 6)]
     cases = written([thinned(case, MOST) for case in cases], tmp_path)
     expected = by_xla(cases)
     for compiler in COMPILERS:

@@ -170,3 +170,12 @@ def test_the_commonest_rules_compute_what_xla_computes(name):
     cases, expected = taken(name, cases), by_xla(cases)
     for known in ((False,) * 4, (True,) * 4):
         compare(name, cases, by_known(cases, known), expected, f"known: {known[0]}")
+
+
+@pytest.mark.parametrize("name", elementwise.FOURTEEN_DIGITS)
+def test_native_code_has_all_digits_where_xla_has_fourteen(name):
+    (case,) = (case for case in CASES[name] if case.arguments[0].dtype == np.float64)
+    with np.errstate(all="ignore"):
+        exact = getattr(np, name)(case.arguments[0])
+    compare(name, [case], by_lanes(case), [[exact]], "beside NumPy")
+    assert not np.any(difference(by_lanes(case)[0], exact, 4.0))

@@ -32,7 +32,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     functions in Mie scattering calculations using continued fractions (1976).
     """
     valid = (a > 0) & (x >= 0)
-    large, whole = a > LARGE, x
+    large, whole, at_zero = a > LARGE, x, (a == 0) & (x > 0)
     by_expansion = large_masses(a, x)
     a, x = jnp.where(large | ~valid, 1.0, a), jnp.where(large | ~valid, 1.0, x)
     above = x > a + 1
@@ -65,7 +65,9 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     beyond = jnp.where(above & (x < jnp.inf), upper, 1 - below)
     p, q = (jnp.where(large & (whole < jnp.inf), e, y) for e, y in zip(by_expansion, (below, beyond), strict=True))
     p, q = jnp.where(whole == jnp.inf, 1.0, p), jnp.where(whole == jnp.inf, 0.0, q)
-    return jnp.where(valid, p, jnp.nan), jnp.where(valid, q, jnp.nan)
+    # A law of shape 0 is all at 0.
+    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
+    return jnp.where(valid | at_zero, p, jnp.nan), jnp.where(valid | at_zero, q, jnp.nan)
 
 
 def large_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
