@@ -35,6 +35,7 @@ node = hg.Node(sensor, hop, {"cubature": hg.cubature_filter(plant, sensor, hop)}
 network = hg.Network(plant, {"a": node, "b": node})
 """
 PLANTS, STEPS, WINDOW, LATEST = 5, 400, 5.0, 3.0
+AHEAD = 0.1  # of `heliograph serve` by default
 PART = 40  # lines that are written at once
 PAUSE = 0.01  # seconds between
 
@@ -119,7 +120,7 @@ def killed(count: int, seed: int, folder: Path) -> dict[str, Any]:
 
 def compared(network: Path, store: Path, sent: list[bytes], known: dict[int, dict[str, Any]]) -> dict[str, Any]:
     """The store against that of a service that was never disturbed, and what was read against the journal."""
-    fleet = Fleet(Lanes(load_network(str(network))), Options(WINDOW))
+    fleet = Fleet(Lanes(load_network(str(network))), Options(WINDOW, AHEAD))
     mine = identity(fleet)
     calm = Service(fleet, Store(str(store.with_name("calm.db")), mine))
     calm.take(sent)
