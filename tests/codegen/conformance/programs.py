@@ -57,7 +57,7 @@ def _branches(k: jax.Array, x: jax.Array) -> Any:
 
 
 def _while(x: jax.Array) -> Any:
-    count = lax.while_loop(lambda s: s[0] > 1, lambda s: (s[0] / 2, s[1] + 1), (x, jnp.int32(0)))
+    count = lax.while_loop(lambda s: (s[0] > 1) & (s[1] < 90), lambda s: (s[0] / 2, s[1] + 1), (x, jnp.int32(0)))
     nested = lax.while_loop(
         lambda s: s[1] < 3, lambda s: (lax.while_loop(lambda v: v < 5, lambda v: v + 1, s[0]), s[1] + 1), (x, 0)
     )

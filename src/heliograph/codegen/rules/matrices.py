@@ -30,14 +30,19 @@ def _reduction(op: str, empty: float) -> Rule:
     return rule
 
 
+ALL_BITS = np.nan  # of "and": true, -1, or the greatest unsigned integer
+
+
 def _within(type: Type, number: float) -> float:
-    """Return the number of this type that is nearest to one: infinity is no integer."""
+    """Return the number of this type that is nearest to one: infinity is no integer. ALL_BITS: that of all bits."""
     if type == "f64" or np.isfinite(number):
         return number
-    greatest = number > 0
+    greatest = number > 0 or number is ALL_BITS
     if type == "bool":
         return greatest
     limits = np.iinfo(DTYPES[type])
+    if number is ALL_BITS and limits.min < 0:
+        return -1
     return limits.max if greatest else limits.min
 
 
@@ -173,7 +178,7 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
 
 RULES |= {
     "reduce_sum": _reduction("add", 0), "reduce_prod": _reduction("mul", 1), "reduce_or": _reduction("or", 0),
-    "reduce_and": _reduction("and", 1), "reduce_xor": _reduction("xor", 0),
+    "reduce_and": _reduction("and", ALL_BITS), "reduce_xor": _reduction("xor", 0),
     "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
     "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"),
     "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": _dot_general,
