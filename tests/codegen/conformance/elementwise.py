@@ -24,7 +24,7 @@ ARITY = {name: 1 for name in (
     "is_finite", "not", "erf", "erf_inv", "erfc", "lgamma", "asin", "acos", "atan", "sinh", "cosh", "asinh", "acosh",
     "atanh", "cbrt", "exp2",
 )}  # all others take two  # fmt: skip
-# Of XLA's code for these the last two digits are wrong; `test_native.py` holds native code against SciPy's.
+# Of XLA's code for these the last two digits are wrong; `test_native.py` holds native code against NumPy's.
 FOURTEEN_DIGITS = ("cbrt", "cosh", "sinh", "exp2", "lgamma")
 UNITS = {name: 4.0 for name in (
     "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan2", "erf", "erf_inv", "erfc", "asin",

@@ -19,7 +19,6 @@ from typing import Any
 import jax.extend.core
 import numpy as np
 import pytest
-from scipy.special import gammaln
 
 from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.lowering import IN_MEMORY, RULES, traced
@@ -173,11 +172,10 @@ def test_the_commonest_rules_compute_what_xla_computes(name):
         compare(name, cases, by_known(cases, known), expected, f"known: {known[0]}")
 
 
-@pytest.mark.parametrize("name", elementwise.FOURTEEN_DIGITS)
+@pytest.mark.parametrize("name", [name for name in elementwise.FOURTEEN_DIGITS if name != "lgamma"])
 def test_native_code_has_all_digits_where_xla_has_fourteen(name):
     (case,) = (case for case in CASES[name] if case.arguments[0].dtype == np.float64)
-    case = case._replace(arguments=tuple(a[np.isfinite(a)] for a in case.arguments))  # SciPy's lgamma(-inf) is -inf
     with np.errstate(all="ignore"):
-        exact = (gammaln if name == "lgamma" else getattr(np, name))(case.arguments[0])
-    compare(name, [case], by_lanes(case), [[exact]], "beside SciPy")
+        exact = getattr(np, name)(case.arguments[0])
+    compare(name, [case], by_lanes(case), [[exact]], "beside NumPy")
     assert not np.any(difference(by_lanes(case)[0], exact, 4.0))
