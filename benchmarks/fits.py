@@ -81,10 +81,16 @@ FAMILIES = {
     "trend": Family("ppp", trend, sizes(-5, 1, 3)),
     "line": Family("ppp", trend, lambda g: np.array([1e-14, 1e-14, np.exp(g.uniform(-5, 1))])),
     "autoregression": Family(
-        "rpp", lambda t: scalar(t[0], t[1], t[2], start=1.0), lambda g: np.array([g.uniform(-0.95, 0.98), *sizes(-3, 1, 2)(g)]), 0.5
+        "rpp",
+        lambda t: scalar(t[0], t[1], t[2], start=1.0),
+        lambda g: np.array([g.uniform(-0.95, 0.98), *sizes(-3, 1, 2)(g)]),
+        0.5,
     ),
     "alternation": Family(
-        "rpp", lambda t: scalar(t[0], t[1], t[2], start=1.0), lambda g: np.array([-0.995, 1e-3, np.exp(g.uniform(-5, 0))]), 0.5
+        "rpp",
+        lambda t: scalar(t[0], t[1], t[2], start=1.0),
+        lambda g: np.array([-0.995, 1e-3, np.exp(g.uniform(-5, 0))]),
+        0.5,
     ),
     "gauss_markov": Family("ppp", gauss_markov, sizes(-2, 1, 3)),
     "mean": Family(
