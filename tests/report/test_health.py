@@ -74,12 +74,13 @@ def test_what_rests_and_has_no_noise_has_a_page():
     assert "all 200 values are 0" in line and health.filters[0].test is None
 
 
-def test_noise_of_one_side_is_no_bias():
+@pytest.mark.parametrize("link", [hg.perfect(), hg.hop(1.5, 0.01), hg.erasure(hg.hop(1.5, 0.01), 0.9)])
+def test_noise_of_one_side_is_no_bias(link):
     """The median of noise that is late by an exponential law lies below its mean; the world is the model's own."""
     law = hg.Contaminated.one_sided(0.01, 0.2, 2.0)
     sensor = hg.LinearSensor([[1.0]], law, outputs=["y"])
-    filters = {"score": hg.robust_filter(PLANT, sensor, hg.perfect())}
-    network = hg.Network(PLANT, {"a": hg.Node(sensor, hg.perfect(), filters)})
+    filters = {"score": hg.robust_filter(PLANT, sensor, link.base if link.erases else link)}
+    network = hg.Network(PLANT, {"a": hg.Node(sensor, link, filters)})
     z = hg.monte_carlo(network, STEPS, 1, key=0).measurements["a"][0]
     summary = health_of(network, {"a": z}).outputs[0].judged.summary
     assert summary.bias_low < 0 < summary.bias_high

@@ -5,8 +5,9 @@ import numpy as np
 
 from heliograph.model.over_time import first
 from heliograph.numerics.types import Float
+from heliograph.random_affine.erasure import arrived
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.outliers import StudentT
+from heliograph.random_affine.outliers import Contaminated, StudentT
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 
@@ -33,7 +34,7 @@ def law_medians(
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)
-    noise, channel = first(receiver.sensor).noise, first(receiver.channel)
+    noise, channel = first(receiver.sensor).noise, arrived(first(receiver.channel))
     if is_symmetric(noise) or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # v through the mean gain, and what else the innovation is made of.
@@ -46,8 +47,9 @@ def law_medians(
 
 
 def is_symmetric(noise: AbstractNoise) -> bool:
-    """Test whether a law is known to be symmetric about its mean."""
+    """Test whether a law is known to be symmetric about its mean: contaminated noise is where no branch is biased."""
     if isinstance(noise, Independent):
         return all(map(is_symmetric, noise.parts))
-    biased = np.any(np.asarray(getattr(noise, "means", 0.0)) != 0)  # the branches of contaminated noise
-    return isinstance(noise, Gaussian | StudentT) or (hasattr(noise, "means") and not biased)
+    if isinstance(noise, Contaminated):
+        return not np.any(np.asarray(noise.means) != 0)
+    return isinstance(noise, Gaussian | StudentT)
